@@ -1,0 +1,1 @@
+"""Personalised head avatars from unstructured clips, trained and animated in Blender."""

@@ -1,0 +1,1 @@
+"""The avatar without Blender: numpy, torch and numba only."""

@@ -1,0 +1,13 @@
+"""The two kinds of error that reach a user as one line."""
+
+
+class PavError(Exception):
+    """Work that failed: the message says what was found, where, and what to do. Exit code 1."""
+
+
+class InputError(PavError):
+    """Wrong input from the user (a file, a name, a value). Exit code 2."""
+
+
+class Cancelled(PavError):
+    """The user stopped the work; nothing is written under the final name."""
