@@ -1,0 +1,28 @@
+"""Two implementations of one interface: `reference` (plain torch, any device) and `cpu` (numba).
+
+Both folders hold the same file names (nearest, encoding, mlp, marching, optimiser) with the same
+functions. Code that computes asks for one of them and never names it:
+
+>>> from pav_blender.core.kernels import select
+>>> kernels = select("cpu")
+>>> kernels.nearest.nearest  # doctest: +SKIP
+"""
+
+from __future__ import annotations
+
+import importlib
+from types import ModuleType
+from typing import Any
+
+MODULES = ("nearest", "encoding", "mlp", "marching", "optimiser")
+
+
+def select(device: Any = "cpu", *, reference: bool = False) -> ModuleType:
+    """The kernels for a device, as a module whose attributes are the names in `MODULES`.
+
+    `device` is what torch accepts ("cpu", "cuda:0", a `torch.device`). Everything but the CPU runs
+    the reference; `reference=True` asks for it on the CPU too. numba is imported only when the
+    compiled kernels are chosen, and each submodule only when it is first touched.
+    """
+    compiled = str(device).split(":")[0] == "cpu" and not reference
+    return importlib.import_module(f"{__name__}.{'cpu' if compiled else 'reference'}")

@@ -1,0 +1,86 @@
+"""One pool of threads for every kernel.
+
+numba's `prange` keeps a work queue of its own that is not safe inside a host process which also
+runs threads (Blender), so kernels are plain `nogil` functions over an index range, and the ranges
+are handed out here.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+_pool: ThreadPoolExecutor | None = None
+_pool_size = 0
+
+
+def threads() -> int:
+    """Workers to use: `PAV_THREADS` if it is a positive number, else the CPUs we may run on."""
+    wanted = os.environ.get("PAV_THREADS", "")
+    if wanted.isdigit() and int(wanted) > 0:
+        return int(wanted)
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _executor(size: int) -> ThreadPoolExecutor:
+    global _pool, _pool_size
+    if _pool is None or _pool_size < size:
+        _pool = ThreadPoolExecutor(size, thread_name_prefix="pav")
+        _pool_size = size
+    return _pool
+
+
+def _forget_pool() -> None:
+    """A forked child has no worker threads: it must start its own."""
+    global _pool, _pool_size
+    _pool, _pool_size = None, 0
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget_pool)
+
+
+def run_chunks(fn: Callable[..., Any], n: int, chunk: int, *args: Any) -> None:
+    """Call `fn(start, stop, *args)` over [0, n) in pieces of `chunk`, on all threads at once.
+
+    Pieces go to whichever thread is free, the caller's included, so uneven work balances itself;
+    which thread runs which piece is not fixed, so pieces must not depend on one another. The first
+    exception is raised here after the others have stopped. Calls may nest.
+    """
+    if chunk < 1:
+        raise ValueError(f"chunk must be at least 1, not {chunk}")
+    pieces = -(-n // chunk)
+    workers = min(threads(), pieces)
+    if workers <= 1:
+        for start in range(0, n, chunk):
+            fn(start, min(start + chunk, n), *args)
+        return
+    counter = itertools.count()
+
+    def work() -> None:
+        for piece in counter:
+            if piece >= pieces:
+                return
+            start = piece * chunk
+            try:
+                fn(start, min(start + chunk, n), *args)
+            except BaseException:
+                for _ in range(pieces):  # nothing is left for the others
+                    if next(counter) >= pieces:
+                        break
+                raise
+
+    helpers = [_executor(workers - 1).submit(work) for _ in range(workers - 1)]
+    try:
+        work()
+    finally:
+        # A helper that never started (a nested call on a full pool) has nothing left to do.
+        running = [helper for helper in helpers if not helper.cancel()]
+        failures = [error for error in (helper.exception() for helper in running) if error]
+    if failures:
+        raise failures[0]
