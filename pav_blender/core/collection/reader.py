@@ -1,0 +1,127 @@
+"""Reading a collection, with every array checked before anything is computed from it."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import InputError
+from ..head import HeadModel, load_head
+from .model import FORMAT, SPLITS, VERSION, Clip, Collection
+from .writer import check_name
+
+_LARGEST_SIDE = 16384
+
+
+def read_collection(path: Path | str) -> Collection:
+    """Reads the collection in folder `path`; pictures stay on disk until they are asked for.
+
+    Raises InputError, one line naming the file and the fault.
+    """
+    path = Path(path)
+    meta_path = path / "collection.json"
+    if not path.is_dir():
+        raise InputError(f"{path}: no such collection folder")
+    if not meta_path.is_file():
+        raise InputError(f"{path}: not a collection (it has no collection.json)")
+    try:
+        meta = json.loads(meta_path.read_text(encoding="utf-8"))
+    except (ValueError, OSError) as error:
+        raise InputError(f"{meta_path}: not readable as JSON ({error})") from error
+    if not isinstance(meta, dict) or meta.get("format") != FORMAT:
+        raise InputError(f"{meta_path}: not a collection file (its format is not {FORMAT!r})")
+    if meta.get("version") != VERSION:
+        raise InputError(
+            f"{meta_path}: version {meta.get('version')!r}; this program reads {VERSION}"
+        )
+    try:
+        head_name = str(meta["head"]["name"])
+        betas = np.asarray(meta["head"]["betas"], np.float32).reshape(-1)
+        entries = [
+            (
+                check_name(str(entry["name"]), "clip name"),
+                str(entry["appearance"]),
+                int(entry["width"]),
+                int(entry["height"]),
+            )
+            for entry in meta["clips"]
+        ]
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{meta_path}: a field is missing or malformed ({error})") from error
+    if not entries:
+        raise InputError(f"{meta_path}: the collection has no clips")
+    if len({entry[0] for entry in entries}) < len(entries):
+        raise InputError(f"{meta_path}: two clips have the same name")
+    head = load_head(head_name)
+    if len(betas) > len(head.shape_basis) or not np.isfinite(betas).all():
+        raise InputError(
+            f"{meta_path}: {len(betas)} identity coefficients; head {head_name!r} takes "
+            f"{len(head.shape_basis)} finite ones at most"
+        )
+    clips = [_read_clip(path, head, *entry) for entry in entries]
+    return Collection(path, head_name, head, betas, clips, dict(meta.get("extra") or {}))
+
+
+def _read_clip(
+    root: Path, head: HeadModel, name: str, appearance: str, width: int, height: int
+) -> Clip:
+    path = root / "clips" / name / "frames.npz"
+    if not (0 < width <= _LARGEST_SIDE and 0 < height <= _LARGEST_SIDE):
+        raise InputError(f"{root}: clip {name}: a picture size of {width}x{height}")
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            arrays = {key: stored[key] for key in stored.files}
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such file; the collection is incomplete") from error
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(f"{path}: damaged ({error})") from error
+    count = len(arrays.get("frame_id", ()))
+    joints, vertices = len(head.joint_names), len(head.template)
+    shapes = {
+        "expression": (count, len(head.expression_basis)),
+        "pose": (count, joints, 3),
+        "translation": (count, 3),
+        "intrinsics": (count, 3, 3),
+        "camera_to_world": (count, 4, 4),
+        "frame_id": (count,),
+        "split": (count,),
+    }
+    if "vertices" in arrays:
+        shapes["vertices"] = (count, vertices, 3)
+    for key, shape in shapes.items():
+        if key not in arrays:
+            raise InputError(f"{path}: the array {key!r} is missing")
+        if arrays[key].shape != shape:
+            raise InputError(f"{path}: {key!r} has shape {arrays[key].shape}, expected {shape}")
+        if arrays[key].dtype.kind == "f":
+            bad = ~np.isfinite(arrays[key].reshape(count, -1)).all(axis=1)
+            if bad.any():
+                frame = arrays["frame_id"][np.flatnonzero(bad)[0]]
+                raise InputError(f"{path}: {key!r} is not finite at frame {frame}")
+    if count == 0:
+        raise InputError(f"{path}: the clip has no frames")
+    if len(np.unique(arrays["frame_id"])) < count or (arrays["frame_id"] < 0).any():
+        raise InputError(f"{path}: 'frame_id' must hold different numbers from 0 up")
+    unknown = sorted(set(np.unique(arrays["split"]).tolist()) - set(SPLITS))
+    if unknown:
+        raise InputError(f"{path}: unknown split {unknown}; use {', '.join(SPLITS)}")
+    floats = [key for key in shapes if arrays[key].dtype.kind in "fiu" and key != "frame_id"]
+    for key in floats:
+        arrays[key] = np.ascontiguousarray(arrays[key], np.float32)
+    return Clip(
+        name=name,
+        appearance=appearance,
+        width=width,
+        height=height,
+        expression=arrays["expression"],
+        pose=arrays["pose"],
+        translation=arrays["translation"],
+        intrinsics=arrays["intrinsics"],
+        camera_to_world=arrays["camera_to_world"],
+        frame_id=arrays["frame_id"].astype(np.int32),
+        split=arrays["split"],
+        vertices=arrays.get("vertices"),
+    )

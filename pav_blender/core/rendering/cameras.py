@@ -1,0 +1,75 @@
+"""A pinhole camera: intrinsics in pixels, camera-to-world with OpenCV axes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """width, height in pixels; intrinsics [3, 3]; camera_to_world [4, 4], metres.
+
+    x right, y down, z forward; the centre of the first pixel is at (0.5, 0.5).
+    Raises InputError for values that are not finite or do not make a camera.
+    """
+
+    width: int
+    height: int
+    intrinsics: np.ndarray
+    camera_to_world: np.ndarray
+
+    def __post_init__(self) -> None:
+        intrinsics = np.asarray(self.intrinsics, np.float64)
+        pose = np.asarray(self.camera_to_world, np.float64)
+        if intrinsics.shape != (3, 3) or pose.shape != (4, 4):
+            raise InputError(
+                f"camera: intrinsics {intrinsics.shape} and camera_to_world {pose.shape}; "
+                "expected (3, 3) and (4, 4)"
+            )
+        if not (np.isfinite(intrinsics).all() and np.isfinite(pose).all()):
+            raise InputError("camera: a value is not finite")
+        if intrinsics[0, 0] <= 0 or intrinsics[1, 1] <= 0:
+            raise InputError("camera: the focal lengths must be positive")
+        if self.width < 1 or self.height < 1:
+            raise InputError(f"camera: a picture of {self.width}x{self.height} pixels")
+        object.__setattr__(self, "intrinsics", intrinsics)
+        object.__setattr__(self, "camera_to_world", pose)
+
+    @property
+    def origin(self) -> np.ndarray:
+        """The camera's centre in the world, [3]."""
+        return self.camera_to_world[:3, 3]
+
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """World points [N, 3] -> pixels [N, 2] and depth along the camera's z [N], float64."""
+        local = (np.asarray(points, np.float64) - self.origin) @ self.camera_to_world[:3, :3]
+        depth = local[:, 2]
+        safe = np.where(np.abs(depth) < 1e-12, 1e-12, depth)
+        homogeneous = local @ self.intrinsics.T
+        return homogeneous[:, :2] / safe[:, None], depth
+
+    def directions(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Pixel columns and rows [N] (integers: their centres) -> unit directions [N, 3] in the
+        world and the cosine to the camera's axis [N] (depth = distance * cosine), float32."""
+        (fx, skew, cx), (_, fy, cy), _ = self.intrinsics
+        v = (np.asarray(y, np.float64) + 0.5 - cy) / fy
+        u = (np.asarray(x, np.float64) + 0.5 - cx - skew * v) / fx
+        local = np.stack([u, v, np.ones_like(u)], axis=1)
+        length = np.linalg.norm(local, axis=1)
+        world = (local / length[:, None]) @ self.camera_to_world[:3, :3].T
+        return world.astype(np.float32), (1 / length).astype(np.float32)
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same view with another number of pixels."""
+        scale = np.diag([width / self.width, height / self.height, 1.0])
+        return replace(self, width=width, height=height, intrinsics=scale @ self.intrinsics)
+
+    def window(self, x0: int, y0: int, x1: int, y1: int) -> Camera:
+        """The camera of the pixels [x0, x1) x [y0, y1), top-left origin."""
+        intrinsics = self.intrinsics.copy()
+        intrinsics[:2, 2] -= (x0, y0)
+        return replace(self, width=x1 - x0, height=y1 - y0, intrinsics=intrinsics)
