@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from ..kernels import cpu as _cpu  # first: it says where numba keeps compiled code
 from .cameras import Camera
+
+from numba import njit  # noqa: E402  # isort: skip
 
 
 def rasterise(
@@ -26,6 +28,9 @@ def rasterise(
         camera.height,
         near,
     )
+
+
+assert _cpu
 
 
 @njit(cache=True, nogil=True)

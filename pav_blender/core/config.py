@@ -1,0 +1,113 @@
+"""Every setting of the method, in one frozen dataclass that is saved with the avatar."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from .errors import InputError
+
+APPEARANCE_MODES = ("vertex", "surface", "global", "none")
+FRAME_MODES = ("smooth", "affine", "rigid")
+
+
+@dataclass(frozen=True)
+class Config:
+    """Defaults are what measured best here; `Config.paper()` is the paper's own."""
+
+    # multi-resolution hash encoding of the canonical point (Instant-NGP; paper, Implementation)
+    levels: int = 16
+    log2_entries: int = 18
+    base_resolution: int = 16
+    finest_resolution: int = 2048
+
+    # appearance embedding (paper, Learned Appearance Embedding)
+    appearance: Literal["vertex", "surface", "global", "none"] = "vertex"
+    latent_channels: int = 16
+    latent_size: int = 512  # side of the texture, "surface" only
+    global_channels: int = 512  # length of the one vector a clip, "global" only
+
+    # networks (paper, Appearance Conditioned NeRF)
+    hidden: int = 64
+    geometry_channels: int = 16  # the first is the log-density
+    density_layers: int = 2
+    offset_layers: int = 1
+    colour_layers: int = 2
+    density_offset: bool = True
+    # the paper's offset sees the embedding and the expression; seeing the point's geometry
+    # features too lets one appearance fill space that another leaves empty
+    offset_sees_geometry: bool = True
+    density_bias: float = -4.5  # log-density per millimetre of an untrained field: thin fog
+    log_density_limit: float = 6.0
+
+    # deformation (paper, Personalized Deformable NeRF)
+    frames: Literal["smooth", "affine", "rigid"] = "smooth"
+    occupancy_resolution: int = 160
+    reach: float = 0.13  # metres from the mesh that the field may fill
+
+    # optimisation (paper, Optimization and Implementation)
+    colour_weight: float = 50.0
+    depth_weight: float = 10.0
+    learning_rate: float = 2.5e-3
+    offset_learning_rate: float = 2.5e-4
+    beta1: float = 0.9
+    beta2: float = 0.99
+    epsilon: float = 1e-15
+    iterations: int = 15_000
+    rays: int = 4096
+    frames_per_batch: int = 8
+    step: float = 1e-3  # metres between samples
+    final_learning_rate: float = 0.03  # as a part of the first, at the end of the schedule
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.appearance not in APPEARANCE_MODES:
+            raise InputError(f"appearance {self.appearance!r}: one of {APPEARANCE_MODES}")
+        if self.frames not in FRAME_MODES:
+            raise InputError(f"frames {self.frames!r}: one of {FRAME_MODES}")
+        for name in ("levels", "hidden", "rays", "iterations", "frames_per_batch"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name} must be at least 1, not {getattr(self, name)}")
+        if not 3 <= self.log2_entries <= 24:
+            raise InputError(f"log2_entries {self.log2_entries}: from 3 to 24")
+        if not self.step > 0:
+            raise InputError(f"step {self.step}: metres, above 0")
+
+    @classmethod
+    def paper(cls) -> Config:
+        """The settings of the paper; where it is silent, INSTA's (reference in docs)."""
+        return cls(
+            frames="rigid",
+            offset_sees_geometry=False,
+            offset_learning_rate=2.5e-4,
+            final_learning_rate=1.0,
+        )
+
+    @classmethod
+    def preset(cls, name: str) -> Config:
+        """"default" or "paper"."""
+        presets = {"default": cls, "paper": cls.paper}
+        if name not in presets:
+            raise InputError(f"preset {name!r}: one of {', '.join(presets)}")
+        return presets[name]()
+
+    @property
+    def embedding_channels(self) -> int:
+        """Length of Z^x, what the networks see of the appearance."""
+        sizes = {"none": 0, "global": self.global_channels}
+        return sizes.get(self.appearance, self.latent_channels)
+
+    def to_json(self) -> dict[str, Any]:
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_json(cls, values: dict[str, Any]) -> Config:
+        """The reverse of to_json; InputError for a setting this program does not know."""
+        known = {f.name: type(f.default) for f in dataclasses.fields(cls)}
+        for name, value in values.items():
+            if name not in known:
+                raise InputError(f"unknown setting {name!r}; was it written by a newer version?")
+            if known[name] is not type(value) and not (known[name] is float and type(value) is int):
+                raise InputError(f"setting {name!r} is {value!r}; expected {known[name].__name__}")
+        return cls(**values)

@@ -1,0 +1,1 @@
+"""The canonical radiance field: encoding, appearance embeddings, three networks, the avatar."""

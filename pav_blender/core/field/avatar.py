@@ -1,0 +1,229 @@
+"""An avatar: the field, the canonical mesh it hangs on, the space it fills; one `.pav` file."""
+
+from __future__ import annotations
+
+import json
+import struct
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors
+import safetensors.torch
+import torch
+
+from ..config import Config
+from ..errors import InputError
+from ..files import replacing
+from ..kernels.reference.encoding import Layout
+from .field import Field
+
+FORMAT = "pav-avatar"
+VERSION = 1
+_LARGEST_HEADER = 100 << 20
+
+
+@dataclass(eq=False)
+class Avatar:
+    """Everything a picture needs beside a posed mesh, a camera and an appearance.
+
+    canonical_vertices [V, 3] metres; triangles [T, 3] int32; uvs [U, 2], uv_triangles [T, 3];
+    rigid_weights [V], how much a vertex says where the head's own axes are; box_min [3] and
+    box_size: the cube of canonical space, metres, that the field fills; occupied
+    [A, G, G, G] bool: its cells that are not empty, an appearance. The mask is part of the model:
+    outside it nothing was trained.
+    """
+
+    config: Config
+    field: Field
+    appearances: list[str]
+    canonical_vertices: np.ndarray
+    triangles: np.ndarray
+    uvs: np.ndarray
+    uv_triangles: np.ndarray
+    rigid_weights: np.ndarray
+    box_min: np.ndarray
+    box_size: float
+    occupied: np.ndarray
+    head_name: str
+    head_fingerprint: str
+    betas: np.ndarray
+    expression_names: tuple[str, ...]
+    record: dict[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def create(
+        cls,
+        config: Config,
+        appearances: list[str],
+        canonical_vertices: np.ndarray,
+        triangles: np.ndarray,
+        uvs: np.ndarray,
+        uv_triangles: np.ndarray,
+        expression_names: tuple[str, ...],
+        **rest: Any,
+    ) -> Avatar:
+        """An untrained avatar; weights follow `config.seed`. Further fields have defaults."""
+        torch.manual_seed(config.seed)
+        low, high = canonical_vertices.min(0), canonical_vertices.max(0)
+        size = float((high - low).max()) + 2 * config.reach
+        cells = (config.occupancy_resolution,) * 3
+        corner_uvs = torch.from_numpy(np.ascontiguousarray(uvs[uv_triangles], np.float32))
+        network = Field(
+            config,
+            len(appearances),
+            len(expression_names),
+            torch.from_numpy(np.ascontiguousarray(triangles, np.int32)),
+            corner_uvs,
+            len(canonical_vertices),
+        )
+        values: dict[str, Any] = {
+            "rigid_weights": np.ones(len(canonical_vertices), np.float32),
+            "box_min": ((low + high) / 2 - size / 2).astype(np.float32),
+            "box_size": size,
+            "occupied": np.ones((len(appearances), *cells), bool),
+            "head_name": "",
+            "head_fingerprint": "",
+            "betas": np.zeros(0, np.float32),
+        }
+        return cls(
+            config,
+            network,
+            list(appearances),
+            np.ascontiguousarray(canonical_vertices, np.float32),
+            np.ascontiguousarray(triangles, np.int32),
+            np.ascontiguousarray(uvs, np.float32),
+            np.ascontiguousarray(uv_triangles, np.int32),
+            expression_names=tuple(expression_names),
+            **(values | rest),
+        )
+
+    def appearance_index(self, name: str) -> int:
+        """Row of an appearance; InputError naming the ones there are."""
+        if name not in self.appearances:
+            raise InputError(
+                f"unknown appearance {name!r}; the avatar has {', '.join(self.appearances)}"
+            )
+        return self.appearances.index(name)
+
+    def save(self, path: Path | str) -> None:
+        """Writes the `.pav` file, whole or not at all."""
+        tensors = {f"field.{k}": v.contiguous() for k, v in self.field.state_dict().items()}
+        arrays = {
+            "mesh.canonical_vertices": self.canonical_vertices,
+            "mesh.triangles": self.triangles,
+            "mesh.uvs": self.uvs,
+            "mesh.uv_triangles": self.uv_triangles,
+            "mesh.rigid_weights": self.rigid_weights,
+            "space.box_min": self.box_min,
+            "space.occupied": np.packbits(self.occupied.reshape(len(self.appearances), -1), 1),
+            "head.betas": np.asarray(self.betas, np.float32),
+        }
+        tensors |= {k: torch.from_numpy(np.ascontiguousarray(v)) for k, v in arrays.items()}
+        header = {
+            "format": FORMAT,
+            "version": VERSION,
+            "config": self.config.to_json(),
+            "appearances": self.appearances,
+            "expression_names": list(self.expression_names),
+            "head": {"name": self.head_name, "fingerprint": self.head_fingerprint},
+            "box_size": self.box_size,
+            "colour_space": "sRGB",
+            "record": self.record,
+        }
+        with replacing(path) as temporary:
+            safetensors.torch.save_file(tensors, temporary, {"pav": json.dumps(header)})
+
+    @classmethod
+    def load(cls, path: Path | str) -> Avatar:
+        """Reads a `.pav` file. InputError, one line, for what is not one or does not fit."""
+        path = Path(path)
+        header = read_header(path)
+        try:
+            with safetensors.safe_open(path, framework="pt") as stored:
+                tensors = {key: stored.get_tensor(key) for key in stored.keys()}  # noqa: SIM118
+            return _assemble(header, tensors)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
+        except (safetensors.SafetensorError, KeyError, TypeError, ValueError, OSError) as error:
+            raise InputError(f"{path}: a damaged avatar file ({error})") from error
+        except RuntimeError as error:  # load_state_dict: a list of every mismatch
+            first = str(error).strip().splitlines()[-1].strip()
+            raise InputError(f"{path}: the weights do not fit the settings ({first})") from error
+
+
+def read_header(path: Path | str) -> dict[str, Any]:
+    """The JSON header of a `.pav` file alone: settings, names, record. Cheap."""
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such avatar file")
+    wrong = InputError(f"{path}: not an avatar file (.pav)")
+    with open(path, "rb") as stream:
+        start = stream.read(8)
+        size = struct.unpack("<Q", start)[0] if len(start) == 8 else 0
+        if not 0 < size <= min(_LARGEST_HEADER, path.stat().st_size):
+            raise wrong
+        raw = stream.read(size)
+    try:
+        header = json.loads(json.loads(raw)["__metadata__"]["pav"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise wrong from error
+    if not isinstance(header, dict) or header.get("format") != FORMAT:
+        raise wrong
+    if header.get("version") != VERSION:
+        raise InputError(
+            f"{path}: avatar version {header.get('version')!r}; this program reads {VERSION}"
+        )
+    return header
+
+
+def _assemble(header: dict[str, Any], tensors: dict[str, torch.Tensor]) -> Avatar:
+    config = Config.from_json(header["config"])
+    appearances = [str(name) for name in header["appearances"]]
+    for name, tensor in tensors.items():
+        if tensor.is_floating_point() and not torch.isfinite(tensor).all():
+            raise InputError(f"the values of {name!r} are not finite")
+    mesh = {k.split(".")[1]: v.numpy() for k, v in tensors.items() if k.startswith("mesh.")}
+    vertices, triangles = mesh["canonical_vertices"], mesh["triangles"]
+    _check_indices("triangles", triangles, len(vertices))
+    _check_indices("uv_triangles", mesh["uv_triangles"], len(mesh["uvs"]))
+    if len(mesh["rigid_weights"]) != len(vertices):
+        raise InputError("rigid_weights and vertices differ in number")
+    cells = config.occupancy_resolution
+    packed = tensors["space.occupied"].numpy()
+    if packed.shape != (len(appearances), -(-(cells**3) // 8)):
+        raise InputError(f"the occupancy has shape {packed.shape}; {cells} cells a side expected")
+    entries = Layout(
+        config.levels, config.log2_entries, config.base_resolution, config.finest_resolution
+    ).entries
+    if len(tensors["field.tables"]) != entries:
+        raise InputError(f"{len(tensors['field.tables'])} table entries; expected {entries}")
+    bits = np.unpackbits(packed, axis=1, count=cells**3)
+    avatar = Avatar.create(
+        config,
+        appearances,
+        vertices,
+        triangles,
+        mesh["uvs"],
+        mesh["uv_triangles"],
+        tuple(str(name) for name in header["expression_names"]),
+        rigid_weights=mesh["rigid_weights"],
+        box_min=tensors["space.box_min"].numpy(),
+        box_size=float(header["box_size"]),
+        occupied=bits.astype(bool).reshape(len(appearances), cells, cells, cells),
+        head_name=str(header["head"]["name"]),
+        head_fingerprint=str(header["head"]["fingerprint"]),
+        betas=tensors["head.betas"].numpy(),
+        record=dict(header["record"]),
+    )
+    state = {k[6:]: v for k, v in tensors.items() if k.startswith("field.")}
+    avatar.field.load_state_dict(state)
+    return avatar
+
+
+def _check_indices(name: str, array: np.ndarray, limit: int) -> None:
+    if array.ndim != 2 or array.shape[1] != 3 or array.dtype != np.int32:
+        raise InputError(f"{name} is {array.dtype} {array.shape}; expected int32 [T, 3]")
+    if len(array) == 0 or array.min() < 0 or array.max() >= limit:
+        raise InputError(f"{name} names vertices outside 0 to {limit - 1}")

@@ -1,0 +1,173 @@
+"""The appearance-conditioned canonical field (paper, Learned Appearance Embedding and
+Appearance Conditioned NeRF).
+
+    F_density: (phi(x_c), e)      -> log-density, geometry features
+    F_offset:  (Z^x, e)           -> offset of the log-density
+    F_color:   (Z^x, d, features) -> colour
+
+Densities are per millimetre and add before the exponential, so that their sum cannot be negative.
+What is constant over a frame (e) or a ray (d) enters a network's first layer as a bias computed
+once a frame or ray: the same numbers, for far fewer operations.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import nn
+
+from .. import kernels
+from ..config import Config
+from ..kernels.reference.encoding import FEATURES, Layout
+from . import directions
+
+
+@dataclass
+class Samples:
+    """N points to evaluate, packed; see the module's conventions for indices.
+
+    canonical [N, 3] in the field's unit box; triangle [N] int32; barycentric [N, 3];
+    appearance [N] int32, frame [N] int32, ray [N] int32 (rows of what follows);
+    expression [frames, E]; direction [rays, 3], unit, in the head's own axes.
+    """
+
+    canonical: torch.Tensor
+    triangle: torch.Tensor
+    barycentric: torch.Tensor
+    appearance: torch.Tensor
+    frame: torch.Tensor
+    ray: torch.Tensor
+    expression: torch.Tensor
+    direction: torch.Tensor
+
+
+class Mlp(nn.Module):
+    """Weights of a ReLU network whose first layer also sees inputs constant over a group."""
+
+    def __init__(
+        self, inputs: int, group_inputs: int, hidden: int, layers: int, outputs: int
+    ) -> None:
+        super().__init__()
+        sizes = [inputs, *[hidden] * layers, outputs]
+        self.weights = nn.ParameterList(
+            nn.Parameter(torch.empty(o, i)) for i, o in zip(sizes[:-1], sizes[1:], strict=True)
+        )
+        self.biases = nn.ParameterList(nn.Parameter(torch.zeros(o)) for o in sizes[1:])
+        self.group_weight = nn.Parameter(torch.zeros(hidden, group_inputs))
+        for weight in self.weights:
+            bound = math.sqrt(6 / weight.shape[1])  # He, uniform
+            nn.init.uniform_(weight, -bound, bound)
+
+    def forward(
+        self, x: torch.Tensor, group_input: torch.Tensor, group: torch.Tensor
+    ) -> torch.Tensor:
+        """x [N, inputs], group_input [G, group_inputs], group [N] int32 -> [N, outputs]."""
+        ops = kernels.select(x.device)
+        bias = group_input @ self.group_weight.T
+        return ops.mlp.mlp(x, list(self.weights), list(self.biases), bias, group)
+
+
+class Field(nn.Module):
+    """The networks and tables of one avatar; its `state_dict` is what a `.pav` holds.
+
+    triangles [T, 3] int32 and corner_uvs [T, 3, 2] (UV at each triangle's corners) are the mesh's
+    and not learned.
+    """
+
+    triangles: torch.Tensor
+    corner_uvs: torch.Tensor
+
+    def __init__(
+        self,
+        config: Config,
+        appearances: int,
+        expressions: int,
+        triangles: torch.Tensor,
+        corner_uvs: torch.Tensor,
+        vertices: int,
+    ) -> None:
+        super().__init__()
+        self.config = config
+        self.layout = Layout(
+            config.levels, config.log2_entries, config.base_resolution, config.finest_resolution
+        )
+        self.register_buffer("triangles", triangles.int().contiguous(), persistent=False)
+        self.register_buffer("corner_uvs", corner_uvs.float().contiguous(), persistent=False)
+        tables = torch.empty(self.layout.entries, FEATURES)
+        self.tables = nn.Parameter(nn.init.uniform_(tables, -1e-4, 1e-4))
+        shape = {
+            "vertex": (appearances, vertices, config.latent_channels),
+            "surface": (
+                appearances,
+                config.latent_size,
+                config.latent_size,
+                config.latent_channels,
+            ),
+            "global": (appearances, config.global_channels),
+            "none": (appearances, 0),
+        }[config.appearance]
+        self.latent = nn.Parameter(torch.randn(shape) * 0.1)
+        embedding, geometry = config.embedding_channels, config.geometry_channels
+        self.density = Mlp(
+            self.layout.width, expressions, config.hidden, config.density_layers, geometry
+        )
+        self.offset: Mlp | None = None
+        if config.density_offset and embedding:
+            seen = geometry - 1 if config.offset_sees_geometry else 0
+            self.offset = Mlp(
+                embedding + seen, expressions, config.hidden, config.offset_layers, 1
+            )
+            # starts as no offset: the shared density comes first
+            nn.init.zeros_(self.offset.weights[-1])
+        self.colour = Mlp(
+            geometry + embedding, directions.CHANNELS, config.hidden, config.colour_layers, 3
+        )
+
+    def embedding(self, samples: Samples, latent: torch.Tensor) -> torch.Tensor:
+        """Z^x [N, C]: the appearance's latent features at the nearest surface point."""
+        ops = kernels.select(self.tables.device)
+        if self.config.appearance == "vertex":
+            return ops.encoding.read_vertices(
+                latent,
+                samples.appearance,
+                self.triangles,
+                samples.triangle,
+                samples.barycentric,
+            )
+        if self.config.appearance == "surface":
+            corners = self.corner_uvs[samples.triangle.long()]
+            uv = (corners * samples.barycentric[:, :, None]).sum(1)
+            return ops.encoding.read_texture(latent, samples.appearance, uv)
+        return latent[samples.appearance.long()]
+
+    def forward(
+        self, samples: Samples, latent: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Density [N] per metre and colour [N, 3], sRGB in [0, 1].
+
+        `latent` stands in for the learned embeddings, e.g. a mixed one (see mixed_latent).
+        """
+        latent = self.latent if latent is None else latent
+        config = self.config
+        ops = kernels.select(self.tables.device)
+        encoded = ops.encoding.encode(samples.canonical, self.tables, self.layout)
+        geometry = self.density(encoded, samples.expression, samples.frame)
+        raw, features = geometry[:, :1], geometry[:, 1:]
+        embedding = self.embedding(samples, latent)
+        if self.offset is not None:
+            seen = [embedding, features] if config.offset_sees_geometry else [embedding]
+            raw = raw + self.offset(
+                torch.cat(seen, 1), samples.expression, samples.frame
+            )
+        inputs = torch.cat([embedding, raw, features], 1)
+        view = directions.spherical_harmonics(samples.direction)
+        colour = torch.sigmoid(self.colour(inputs, view, samples.ray))
+        # the clamp also stops the gradient there, so that weights do not run away
+        log_density = torch.clamp(raw[:, 0] + config.density_bias, max=config.log_density_limit)
+        return torch.exp(log_density) * 1e3, colour
+
+    def mixed_latent(self, weights: torch.Tensor) -> torch.Tensor:
+        """The latent features of a blend of appearances: weights [A] -> [1, ...]."""
+        return torch.tensordot(weights.to(self.latent), self.latent.detach(), 1)[None]
