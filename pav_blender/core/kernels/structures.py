@@ -1,0 +1,60 @@
+"""What the kernels exchange: a posed mesh with its maps, the clearance grid, a wave of samples."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+
+MODES = ("rigid", "affine", "smooth")
+
+
+@dataclass(frozen=True, eq=False)
+class PosedMesh:
+    """A mesh in one pose: where its triangles are, and the way back to the canonical mesh.
+
+    `search` is what the kernels' `refit` returned. With one map a triangle (modes "rigid" and
+    "affine") `triangle_maps` is [T,3,4] and a posed point x of nearest triangle i goes to
+    `M_i [x, 1]`. In mode "smooth" `vertex_maps` [V,3,4] = [L | c] holds a linear part and the
+    canonical place of each vertex, and x with nearest point p of barycentrics b goes to
+    `sum_j b_j (L_j (x - p) + c_j)`.
+    """
+
+    mode: str
+    search: Any
+    triangles: torch.Tensor  # [T,3] int32
+    vertices: torch.Tensor  # [V,3] float32, posed
+    triangle_maps: torch.Tensor | None = None
+    vertex_maps: torch.Tensor | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Clearance:
+    """How far the occupied canonical cells are from each cell, for leaping over empty space.
+
+    `grid[i, j, k]` (x, y, z) is 0 in an occupied cell, else the chessboard distance in cells to the
+    nearest occupied one (capped at 255). A canonical point x lies in cell
+    `floor((x - box_min) * box_scale * G)`; outside the box nothing is occupied.
+    """
+
+    grid: torch.Tensor  # [G,G,G] uint8
+    box_min: torch.Tensor  # [3] float32, metres
+    box_scale: float  # 1 / side of the box in metres
+
+    @property
+    def cell(self) -> float:
+        """Side of a cell in metres."""
+        return 1.0 / (self.box_scale * self.grid.shape[0])
+
+
+class Wave(NamedTuple):
+    """Up to W occupied samples a ray; entries beyond `count` hold -1 (k, triangle) and zeros."""
+
+    count: torch.Tensor  # [R] int32
+    next: torch.Tensor  # [R] int32: lattice index to continue from, last + 1 when finished
+    k: torch.Tensor  # [R,W] int32, lattice index: t = (k + jitter) * step
+    triangle: torch.Tensor  # [R,W] int32
+    barycentric: torch.Tensor  # [R,W,3]
+    canonical: torch.Tensor  # [R,W,3] metres
+    distance: torch.Tensor  # [R,W] metres, to the posed mesh
