@@ -1,0 +1,120 @@
+"""Adam for the CPU: one pass over memory a step; see `reference/optimiser.py`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+from torch import Tensor
+
+from pav_blender.core.errors import InputError
+from pav_blender.core.kernels.cpu.threads import run_chunks
+from pav_blender.core.kernels.reference.optimiser import check_adam, touched_rows
+
+CHUNK = 1 << 16
+
+
+def adam_step(
+    param: Tensor,
+    grad: Tensor,
+    m: Tensor,
+    v: Tensor,
+    *,
+    step: int,
+    lr: float,
+    beta1: float = 0.9,
+    beta2: float = 0.99,
+    eps: float = 1e-15,
+    weight_decay: float = 0.0,
+    zero_grad: bool = True,
+) -> None:
+    """As the reference, on contiguous float32."""
+    check_adam(param, grad, m, v, step)
+    arrays = [_flat(tensor) for tensor in (param, grad, m, v)]
+    settings = _settings(step, lr, beta1, beta2, eps, weight_decay)
+    run_chunks(_adam, param.numel(), CHUNK, *arrays, settings, zero_grad)
+
+
+def sparse_adam_step(
+    param: Tensor,
+    grad: Tensor,
+    m: Tensor,
+    v: Tensor,
+    rows: Tensor | None = None,
+    *,
+    step: int,
+    lr: float,
+    beta1: float = 0.9,
+    beta2: float = 0.99,
+    eps: float = 1e-15,
+    weight_decay: float = 0.0,
+    zero_grad: bool = True,
+) -> None:
+    """As the reference, on contiguous float32."""
+    check_adam(param, grad, m, v, step)
+    width = param.shape[-1]
+    arrays = [_flat(tensor) for tensor in (param, grad, m, v)]
+    settings = _settings(step, lr, beta1, beta2, eps, weight_decay)
+    if rows is None and param.ndim == 2:
+        chunk = max(1, CHUNK // max(1, width))
+        run_chunks(_adam_nonzero, len(param), chunk, width, *arrays, settings, zero_grad)
+        return
+    index = touched_rows(param, grad, rows).contiguous().numpy()
+    chunk = max(1, CHUNK // 8 // max(1, width))
+    run_chunks(_adam_rows, len(index), chunk, index, width, *arrays, settings, zero_grad)
+
+
+def _settings(
+    step: int, lr: float, beta1: float, beta2: float, eps: float, weight_decay: float
+) -> np.ndarray:
+    """The step's numbers as the kernel wants them, worked out in double precision."""
+    rate = lr / (1 - beta1**step)
+    spread = 1 / (1 - beta2**step) ** 0.5
+    return np.array([rate, spread, beta1, beta2, eps, weight_decay], np.float64)
+
+
+def _flat(tensor: Tensor) -> Any:
+    if not tensor.is_contiguous() or tensor.device.type != "cpu":
+        raise InputError("the CPU's Adam works in place on contiguous tensors in main memory only")
+    array = tensor.detach().view(-1).numpy()
+    if array.dtype != np.float32:
+        raise InputError(f"the CPU's Adam works on float32, not on {tensor.dtype}")
+    return array
+
+
+@njit(cache=True, nogil=True, fastmath={"contract", "nsz"}, error_model="numpy")
+def _adam(start, stop, param, grad, m, v, settings, zero_grad):
+    rate = np.float32(settings[0])
+    spread = np.float32(settings[1])
+    keep1, take1 = np.float32(settings[2]), np.float32(1 - settings[2])
+    keep2, take2 = np.float32(settings[3]), np.float32(1 - settings[3])
+    eps = np.float32(settings[4])
+    decay = np.float32(settings[5])
+    for i in range(start, stop):
+        g = grad[i] + decay * param[i]
+        first = keep1 * m[i] + take1 * g
+        second = keep2 * v[i] + take2 * g * g
+        m[i] = first
+        v[i] = second
+        param[i] -= rate * first / (np.sqrt(second) * spread + eps)
+        if zero_grad:
+            grad[i] = np.float32(0)
+
+
+@njit(cache=True, nogil=True)
+def _adam_rows(start, stop, rows, width, param, grad, m, v, settings, zero_grad):
+    for k in range(start, stop):
+        first = rows[k] * width
+        _adam(first, first + width, param, grad, m, v, settings, zero_grad)
+
+
+@njit(cache=True, nogil=True)
+def _adam_nonzero(start, stop, width, param, grad, m, v, settings, zero_grad):
+    for row in range(start, stop):
+        first = row * width
+        touched = False
+        for i in range(first, first + width):
+            touched |= grad[i] != 0
+        if touched:
+            _adam(first, first + width, param, grad, m, v, settings, zero_grad)
