@@ -1,0 +1,25 @@
+"""The head that comes with the project (CC0; see ``data/ORIGIN.md``)."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+
+from pav_blender.core.head.files import read_head
+from pav_blender.core.head.model import HeadModel
+
+BUILTIN = "builtin"
+BUILTIN_PATH = Path(__file__).parent / "data" / "builtin_head.npz"
+
+
+@lru_cache(maxsize=1)
+def builtin_head() -> HeadModel:
+    """The built-in head; read once."""
+    return read_head(BUILTIN_PATH)
+
+
+def load_head(name_or_path: str | Path) -> HeadModel:
+    """The head called "builtin", or the one in a head file."""
+    if str(name_or_path) == BUILTIN:
+        return builtin_head()
+    return read_head(name_or_path)
