@@ -142,6 +142,31 @@ class Field(nn.Module):
             return ops.encoding.read_texture(latent, samples.appearance, uv)
         return latent[samples.appearance.long()]
 
+    def _geometry(
+        self, samples: Samples, latent: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Log-density before its bias [N, 1], geometry features [N, C - 1], embedding Z^x."""
+        ops = kernels.select(self.tables.device)
+        encoded = ops.encoding.encode(samples.canonical, self.tables, self.layout)
+        geometry = self.density(encoded, samples.expression, samples.frame)
+        raw, features = geometry[:, :1], geometry[:, 1:]
+        embedding = self.embedding(samples, latent)
+        if self.offset is not None:
+            sees = self.config.offset_sees_geometry
+            seen = torch.cat([embedding, features], 1) if sees else embedding
+            raw = raw + self.offset(seen, samples.expression, samples.frame)
+        return raw, features, embedding
+
+    def _density(self, raw: torch.Tensor) -> torch.Tensor:
+        # the clamp also stops the gradient there, so that weights do not run away
+        limit = self.config.log_density_limit
+        log_density = torch.clamp(raw[:, 0] + self.config.density_bias, max=limit)
+        return torch.exp(log_density) * 1e3
+
+    def densities(self, samples: Samples, latent: torch.Tensor | None = None) -> torch.Tensor:
+        """Density alone [N], per metre: what a ray needs to know where it ends."""
+        return self._density(self._geometry(samples, self.latent if latent is None else latent)[0])
+
     def forward(
         self, samples: Samples, latent: torch.Tensor | None = None
     ) -> tuple[torch.Tensor, torch.Tensor]:
@@ -150,23 +175,11 @@ class Field(nn.Module):
         `latent` stands in for the learned embeddings, e.g. a mixed one (see mixed_latent).
         """
         latent = self.latent if latent is None else latent
-        config = self.config
-        ops = kernels.select(self.tables.device)
-        encoded = ops.encoding.encode(samples.canonical, self.tables, self.layout)
-        geometry = self.density(encoded, samples.expression, samples.frame)
-        raw, features = geometry[:, :1], geometry[:, 1:]
-        embedding = self.embedding(samples, latent)
-        if self.offset is not None:
-            seen = [embedding, features] if config.offset_sees_geometry else [embedding]
-            raw = raw + self.offset(
-                torch.cat(seen, 1), samples.expression, samples.frame
-            )
+        raw, features, embedding = self._geometry(samples, latent)
         inputs = torch.cat([embedding, raw, features], 1)
         view = directions.spherical_harmonics(samples.direction)
         colour = torch.sigmoid(self.colour(inputs, view, samples.ray))
-        # the clamp also stops the gradient there, so that weights do not run away
-        log_density = torch.clamp(raw[:, 0] + config.density_bias, max=config.log_density_limit)
-        return torch.exp(log_density) * 1e3, colour
+        return self._density(raw), colour
 
     def mixed_latent(self, weights: torch.Tensor) -> torch.Tensor:
         """The latent features of a blend of appearances: weights [A] -> [1, ...]."""

@@ -1,0 +1,86 @@
+"""How well an avatar shows frames it has not seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..collection import Collection
+from ..field.avatar import Avatar
+from ..progress import Report
+from ..rendering.render import RenderSettings, render
+from ..training.frames import Frame, load_frames
+from .metrics import over, psnr, ssim
+
+BACKGROUND = 1.0  # pictures are compared before white
+
+
+@dataclass(eq=False)
+class Score:
+    """One frame: whole picture and head pixels in dB; rendered [H, W, 4] in [0, 1]."""
+
+    frame: Frame
+    appearance: str
+    psnr: float
+    head_psnr: float
+    ssim: float
+    rendered: np.ndarray
+
+
+def head_mask(rgba: np.ndarray) -> np.ndarray:
+    """Pixels [H, W] of the person: where the matte (uint8) is more than half."""
+    return rgba[..., 3] > 127
+
+
+def score(avatar: Avatar, frame: Frame, appearance: str, settings: RenderSettings) -> Score:
+    """Renders a frame wearing `appearance` and compares it with the frame's own picture."""
+    picture = render(
+        avatar, frame.vertices, frame.camera, appearance, settings, expression=frame.expression
+    )
+    shown = np.floor(picture.rgba * 255 + 0.5) / 255  # as the file would hold it
+    ours, truth = over(shown, BACKGROUND), over(frame.rgba / 255, BACKGROUND)
+    return Score(
+        frame,
+        appearance,
+        psnr(ours, truth),
+        psnr(ours, truth, head_mask(frame.rgba)),
+        ssim(ours, truth),
+        shown,
+    )
+
+
+def held_out(
+    avatar: Avatar,
+    collection: Collection,
+    *,
+    splits: tuple[str, ...] = ("test",),
+    per_appearance: int | None = None,
+    settings: RenderSettings | None = None,
+    progress: Report | None = None,
+) -> list[Score]:
+    """Scores of held-out frames, at most `per_appearance` each, spread over the clip."""
+    settings = settings or RenderSettings()
+    frames = chosen_frames(collection, splits, per_appearance)
+    scores = []
+    for done, frame in enumerate(frames):
+        scores.append(score(avatar, frame, avatar.appearances[frame.appearance], settings))
+        if progress:
+            progress((done + 1) / len(frames), frame=frame.name, psnr=scores[-1].psnr)
+    return scores
+
+
+def chosen_frames(
+    collection: Collection, splits: tuple[str, ...], per_appearance: int | None
+) -> list[Frame]:
+    """Frames of the splits, evenly spread, at most `per_appearance` of each appearance."""
+    frames: list[Frame] = []
+    for appearance in collection.appearances:
+        clips = [c for c in collection.clips if c.appearance == appearance]
+        rows = [(clip, row) for clip in clips for row in clip.indices(*splits)]
+        if per_appearance is not None and len(rows) > per_appearance:
+            at = np.linspace(0, len(rows) - 1, per_appearance).round().astype(int)
+            rows = [rows[i] for i in at]
+        for clip, row in rows:
+            frames += load_frames(collection, clip, np.array([row]), targets=False)
+    return frames

@@ -1,0 +1,94 @@
+"""Rays of one posed mesh, and the samples along them as the field takes them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from ..deformation import Clearance
+from ..field.field import Samples
+from ..kernels.structures import Wave
+from .cameras import Camera
+
+
+@dataclass(eq=False)
+class RayBatch:
+    """R rays: origins, directions [R, 3] (unit), cosine [R] (camera depth = t * cosine)."""
+
+    origins: torch.Tensor
+    directions: torch.Tensor
+    cosine: torch.Tensor
+
+    def __len__(self) -> int:
+        return len(self.cosine)
+
+    def pick(self, rows: torch.Tensor) -> RayBatch:
+        return RayBatch(self.origins[rows], self.directions[rows], self.cosine[rows])
+
+
+def camera_rays(camera: Camera, columns: np.ndarray, rows: np.ndarray) -> RayBatch:
+    """Rays through the centres of pixels (columns [R], rows [R])."""
+    directions, cosine = camera.directions(columns, rows)
+    origin = torch.from_numpy(camera.origin.astype(np.float32))
+    return RayBatch(
+        origin.expand(len(columns), 3).contiguous(),
+        torch.from_numpy(directions),
+        torch.from_numpy(cosine),
+    )
+
+
+@dataclass(eq=False)
+class Packed:
+    """The samples of a wave, flat: ray [N] int32 (sorted), t [N] metres, where each lies."""
+
+    ray: torch.Tensor
+    t: torch.Tensor
+    triangle: torch.Tensor
+    barycentric: torch.Tensor
+    canonical: torch.Tensor
+
+    def __len__(self) -> int:
+        return len(self.ray)
+
+
+def pack(wave: Wave, jitter: torch.Tensor, step: float) -> Packed:
+    """Drops the empty slots of a wave."""
+    width = wave.k.shape[1]
+    used = torch.arange(width)[None, :] < wave.count[:, None]
+    slots = used.reshape(-1).nonzero()[:, 0]
+    ray = torch.div(slots, width, rounding_mode="floor")
+    t = (wave.k.reshape(-1)[slots].float() + jitter[ray]) * step
+    return Packed(
+        ray.int(),
+        t,
+        wave.triangle.reshape(-1)[slots],
+        wave.barycentric.reshape(-1, 3)[slots],
+        wave.canonical.reshape(-1, 3)[slots],
+    )
+
+
+def samples_of(
+    packed: Packed,
+    clearance: Clearance,
+    appearance: int,
+    expression: torch.Tensor,
+    directions: torch.Tensor,
+    head_rotation: np.ndarray,
+) -> Samples:
+    """What the field needs for samples of one frame: expression [E], ray directions [R, 3]."""
+    count = len(packed)
+    turned = directions @ torch.from_numpy(head_rotation)
+    return Samples(
+        canonical=(packed.canonical - clearance.box_min) * clearance.box_scale,
+        triangle=packed.triangle,
+        barycentric=packed.barycentric,
+        appearance=torch.full((count,), appearance, dtype=torch.int32),
+        frame=torch.zeros(count, dtype=torch.int32),
+        ray=packed.ray,
+        expression=expression[None],
+        direction=turned,
+    )
+
+

@@ -1,0 +1,238 @@
+"""A picture of an avatar: rays marched in waves, front to back, until they are opaque."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from .. import kernels
+from ..deformation import Clearance, Deformer, PosedMesh, clearance
+from ..deformation.rigid import head_rotation
+from ..errors import Cancelled, InputError
+from ..field.avatar import Avatar
+from .cameras import Camera
+from .rays import RayBatch, camera_rays, pack, samples_of
+
+Appearance = str | Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class RenderSettings:
+    """step: metres between samples; transmittance: a ray ends when less of it is left.
+
+    band: metres round the mesh that are sampled; skip: leap over cells known to be empty;
+    wave: samples a ray between two looks at its transmittance; chunk: rays at once.
+    """
+
+    step: float = 1e-3
+    transmittance: float = 1e-3
+    skip: bool = True
+    wave: int = 6
+    chunk: int = 16_384
+
+    @classmethod
+    def preset(cls, name: str) -> RenderSettings:
+        """"preview" (fast), "final", "reference" (every sample, to the end of the ray)."""
+        presets = {
+            "preview": cls(step=2.5e-3, transmittance=1e-2),
+            "final": cls(),
+            "reference": cls(step=3.9e-4, transmittance=0.0, skip=False, wave=64),
+        }
+        if name not in presets:
+            raise InputError(f"quality {name!r}: one of {', '.join(presets)}")
+        return presets[name]
+
+
+@dataclass(eq=False)
+class Picture:
+    """rgba [H, W, 4] float32, straight sRGB; depth [H, W] float32, metres along z, inf if empty."""
+
+    rgba: np.ndarray
+    depth: np.ndarray
+
+
+@dataclass(eq=False)
+class Scene:
+    """An avatar in a pose, wearing something: what all rays of a picture share."""
+
+    avatar: Avatar
+    mesh: PosedMesh
+    clearance: Clearance
+    rotation: np.ndarray
+    expression: torch.Tensor
+    latent: torch.Tensor
+
+
+_deformers: weakref.WeakKeyDictionary[Avatar, Deformer] = weakref.WeakKeyDictionary()
+_clearances: weakref.WeakKeyDictionary[Avatar, dict[tuple[int, ...], Clearance]] = (
+    weakref.WeakKeyDictionary()
+)
+
+
+def deformer_of(avatar: Avatar) -> Deformer:
+    """The avatar's deformer, built once."""
+    if avatar not in _deformers:
+        _deformers[avatar] = Deformer(
+            avatar.canonical_vertices, avatar.triangles, avatar.config.frames
+        )
+    return _deformers[avatar]
+
+
+def space_of(avatar: Avatar, rows: tuple[int, ...]) -> Clearance:
+    """Where the appearances in `rows` fill space, computed once."""
+    known = _clearances.setdefault(avatar, {})
+    if rows not in known:
+        occupied = avatar.occupied[list(rows)].any(0)
+        known[rows] = clearance_of(occupied, avatar.box_min, avatar.box_size)
+    return known[rows]
+
+
+def clearance_of(occupied: np.ndarray, box_min: np.ndarray, box_size: float) -> Clearance:
+    """The clearance grid of cells [G, G, G] bool over a cube."""
+    return Clearance(
+        torch.from_numpy(clearance(occupied)),
+        torch.from_numpy(np.asarray(box_min, np.float32)),
+        1 / box_size,
+    )
+
+
+def appearance_weights(avatar: Avatar, appearance: Appearance) -> np.ndarray:
+    """Weights [A], sum 1. InputError for unknown names or weights that make no blend."""
+    chosen = {appearance: 1.0} if isinstance(appearance, str) else dict(appearance)
+    weights = np.zeros(len(avatar.appearances), np.float32)
+    for name, weight in chosen.items():
+        weights[avatar.appearance_index(name)] += weight
+    total = float(weights.sum())
+    if not (np.isfinite(weights).all() and (weights >= 0).all() and total > 0):
+        raise InputError(f"appearance weights {chosen}: finite, none negative, one above 0")
+    return weights / total
+
+
+def pose_scene(
+    avatar: Avatar,
+    vertices: np.ndarray,
+    appearance: Appearance,
+    expression: np.ndarray | None = None,
+) -> Scene:
+    """vertices [V, 3] metres, expression [E] (zeros if None). InputError for what does not fit."""
+    vertices = np.ascontiguousarray(vertices, np.float32)
+    if vertices.shape != avatar.canonical_vertices.shape:
+        raise InputError(
+            f"the mesh has {len(vertices)} vertices; this avatar was trained on a head with "
+            f"{len(avatar.canonical_vertices)}"
+        )
+    if not np.isfinite(vertices).all():
+        raise InputError("the mesh has vertices that are not finite")
+    count = len(avatar.expression_names)
+    values = np.zeros(count, np.float32) if expression is None else np.asarray(expression)
+    if values.shape != (count,) or not np.isfinite(values).all():
+        raise InputError(f"expression: {values.shape} values; the avatar takes {count} finite ones")
+    weights = appearance_weights(avatar, appearance)
+    rows = tuple(int(i) for i in np.flatnonzero(weights))
+    return Scene(
+        avatar,
+        deformer_of(avatar).pose(vertices),
+        space_of(avatar, rows),
+        head_rotation(avatar.canonical_vertices, vertices, avatar.rigid_weights),
+        torch.from_numpy(values.astype(np.float32)),
+        avatar.field.mixed_latent(torch.from_numpy(weights)),
+    )
+
+
+def render(
+    avatar: Avatar,
+    vertices: np.ndarray,
+    camera: Camera,
+    appearance: Appearance,
+    settings: RenderSettings | None = None,
+    *,
+    expression: np.ndarray | None = None,
+    region: tuple[int, int, int, int] | None = None,
+    progress: Callable[[float], None] | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> Picture:
+    """Renders the avatar on a posed mesh [V, 3]; the paper's Eq. 2 as a quadrature.
+
+    appearance: a name, or weights by name. region: only the pixels (x0, y0, x1, y1), top-left
+    origin. Raises InputError for input that does not fit and Cancelled when `should_stop()`.
+    """
+    settings = settings or RenderSettings()
+    if region is not None:
+        camera = camera.window(*region)
+    with torch.inference_mode():
+        scene = pose_scene(avatar, vertices, appearance, expression)
+        count = camera.width * camera.height
+        rgba = np.zeros((count, 4), np.float32)
+        depth = np.full(count, np.inf, np.float32)
+        for start in range(0, count, settings.chunk):
+            if should_stop is not None and should_stop():
+                raise Cancelled("rendering was cancelled")
+            pixels = np.arange(start, min(start + settings.chunk, count))
+            rays = camera_rays(camera, pixels % camera.width, pixels // camera.width)
+            rgba[pixels], depth[pixels] = _trace(scene, rays, settings)
+            if progress is not None:
+                progress(min(1.0, (start + settings.chunk) / count))
+    shape = (camera.height, camera.width)
+    return Picture(rgba.reshape(*shape, 4), depth.reshape(shape))
+
+
+def _trace(scene: Scene, rays: RayBatch, settings: RenderSettings) -> tuple[np.ndarray, np.ndarray]:
+    """Straight RGBA [R, 4] and depth along the camera's axis [R]."""
+    count = len(rays)
+    colour, opacity = torch.zeros(count, 3), torch.zeros(count)
+    depth, left = torch.zeros(count), torch.ones(count)
+    ops = kernels.select("cpu")
+    jitter = torch.full((count,), 0.5)
+    margin = scene.avatar.config.reach
+    near, far = ops.marching.bounds(scene.mesh.vertices, margin, rays.origins, rays.directions)
+    first, last = ops.marching.lattice(near, far, jitter, settings.step)
+    alive = (last >= first).nonzero()[:, 0]
+    while len(alive):
+        part = rays.pick(alive)
+        wave = ops.marching.march(
+            scene.mesh,
+            part.origins,
+            part.directions,
+            first[alive],
+            last[alive],
+            jitter[alive],
+            settings.step,
+            wave=settings.wave,
+            clearance=scene.clearance,
+            band=margin,
+            leap_limit=0.004 if settings.skip else 0.0,
+        )
+        packed = pack(wave, jitter[alive], settings.step)
+        if len(packed):
+            samples = samples_of(
+                packed, scene.clearance, 0, scene.expression, part.directions, scene.rotation
+            )
+            sigma, rgb = scene.avatar.field(samples, scene.latent)
+            ops.marching.composite_step(
+                sigma,
+                rgb,
+                packed.t,
+                settings.step,
+                alive[packed.ray.long()].int(),
+                left,
+                colour,
+                opacity,
+                depth,
+            )
+        first[alive] = wave.next
+        going = (wave.next <= last[alive]) & (left[alive] > settings.transmittance)
+        alive = alive[going]
+    seen = opacity > 1e-4
+    safe = torch.where(seen, opacity, 1.0)[:, None]
+    straight = (colour / safe).clamp(0, 1)
+    # a ray that was ended early is opaque: what is left of it would be seen through nothing
+    alpha = torch.where(left <= settings.transmittance, 1.0, opacity).clamp(0, 1)
+    rgba = torch.where(seen[:, None], torch.cat([straight, alpha[:, None]], 1), 0.0)
+    along = torch.where(seen, depth / safe[:, 0] * rays.cosine, torch.inf)
+    return rgba.numpy(), along.numpy()
+
+

@@ -1,0 +1,79 @@
+"""Training that was interrupted, on disk: the avatar so far and what the optimiser knew."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import safetensors
+import safetensors.torch
+import torch
+
+from ..errors import InputError
+from ..files import replacing
+from .trainer import Status, Trainer
+
+FORMAT = "pav-checkpoint"
+
+
+def checkpoint_path(avatar_path: Path) -> Path:
+    """Where the checkpoint of an avatar being trained lies: beside it."""
+    return avatar_path.with_suffix(".checkpoint")
+
+
+def save_checkpoint(path: Path, trainer: Trainer, source: str) -> None:
+    """Writes the whole state of `trainer`; `source` says which data it was learning from."""
+    tensors: dict[str, torch.Tensor] = {
+        f"field.{name}": value for name, value in trainer.avatar.field.state_dict().items()
+    }
+    for name, (m, v) in trainer.moments.items():
+        tensors[f"m.{name}"], tensors[f"v.{name}"] = m, v
+    tensors["occupied"] = torch.from_numpy(trainer.visibility.occupied)
+    tensors["weight"], tensors["looks"] = trainer.visibility.weight, trainer.visibility.looks
+    tensors["generator"] = trainer.generator.get_state()
+    header = {
+        "format": FORMAT,
+        "source": source,
+        "config": trainer.config.to_json(),
+        "minutes": trainer.minutes,
+        "status": dataclasses.asdict(trainer.status),
+        "random": trainer.random.bit_generator.state,
+    }
+    with replacing(path) as temporary:
+        safetensors.torch.save_file(
+            {k: v.contiguous() for k, v in tensors.items()},
+            temporary,
+            {"pav": json.dumps(header)},
+        )
+
+
+def load_checkpoint(path: Path, trainer: Trainer, source: str) -> None:
+    """Puts `trainer`, made from the same data and settings, where the checkpoint left off.
+
+    Raises InputError where the file is damaged or was made from something else.
+    """
+    try:
+        with safetensors.safe_open(path, framework="pt") as stored:
+            header = json.loads(stored.metadata()["pav"])
+            tensors = {key: stored.get_tensor(key) for key in stored.keys()}  # noqa: SIM118
+    except (safetensors.SafetensorError, KeyError, TypeError, ValueError, OSError) as error:
+        raise InputError(f"{path}: a damaged checkpoint; remove it to begin anew") from error
+    if header.get("format") != FORMAT or header["config"] != trainer.config.to_json():
+        raise InputError(f"{path}: made with other settings; remove it to begin anew")
+    if header["source"] != source:
+        raise InputError(f"{path}: made from another collection; remove it to begin anew")
+    try:
+        state = {k[6:]: v for k, v in tensors.items() if k.startswith("field.")}
+        trainer.avatar.field.load_state_dict(state)
+        for name, (m, v) in trainer.moments.items():
+            m.copy_(tensors[f"m.{name}"])
+            v.copy_(tensors[f"v.{name}"])
+        trainer.visibility.restore(
+            tensors["occupied"].numpy(), tensors["weight"], tensors["looks"]
+        )
+        trainer.generator.set_state(tensors["generator"])
+        trainer.random.bit_generator.state = header["random"]
+        trainer.status = Status(**header["status"])
+    except (KeyError, RuntimeError, ValueError, TypeError) as error:
+        raise InputError(f"{path}: does not fit this training; remove it to begin anew") from error

@@ -1,0 +1,42 @@
+"""The paper's losses (Optimization): colour and depth, each a mean over the rays of a batch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from ..config import Config
+from .batches import Pixels
+
+
+@dataclass(frozen=True)
+class Loss:
+    """total is what is minimised; mse is the plain colour error."""
+
+    total: torch.Tensor
+    mse: float
+    depth: float
+
+
+def losses(
+    config: Config,
+    pixels: Pixels,
+    background: torch.Tensor,
+    colour: torch.Tensor,
+    opacity: torch.Tensor,
+    depth: torch.Tensor,
+) -> Loss:
+    """Predicted premultiplied colour [R, 3], opacity [R], ray termination [R] (sum of w t).
+
+    Prediction and target stand before the same random background [R, 3], so that the mattes
+    teach where the avatar ends.
+    """
+    alpha = pixels.alpha[:, None]
+    target = pixels.colour * alpha + background * (1 - alpha)
+    shown = colour + background * (1 - opacity[:, None])
+    mse = (shown - target).square().mean()
+    face = pixels.depth > 0
+    gap = torch.where(face, (depth * pixels.rays.cosine - pixels.depth).abs(), 0.0).mean()
+    total = config.colour_weight * mse + config.depth_weight * gap
+    return Loss(total, float(mse.detach()), float(gap.detach()))

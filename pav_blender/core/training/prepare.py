@@ -1,0 +1,93 @@
+"""What happens once before training: frames read, space carved, an untrained avatar made."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..collection import Collection
+from ..config import Config
+from ..errors import InputError
+from ..field.avatar import Avatar
+from ..progress import Report
+from .carving import carve, hull_box
+from .frames import Frame, load_frames
+
+
+def load_training_frames(collection: Collection, progress: Report | None = None) -> list[Frame]:
+    """Every frame of the "train" split; InputError where an appearance has none."""
+    frames: list[Frame] = []
+    total = sum(len(clip.indices("train")) for clip in collection.clips)
+    for clip in collection.clips:
+        done = len(frames)
+
+        def report(part: float, *, done: int = done, rows: int = 0, **fields: object) -> None:
+            if progress:
+                progress((done + part * rows) / max(total, 1), **fields)
+
+        rows = clip.indices("train")
+        frames += load_frames(
+            collection,
+            clip,
+            rows,
+            progress=lambda part, rows=len(rows), report=report, **fields: report(
+                part, rows=rows, **fields
+            ),
+        )
+    for index, name in enumerate(collection.appearances):
+        if not any(f.appearance == index and f.rgba[..., 3].any() for f in frames):
+            raise InputError(
+                f"{collection.path}: appearance {name!r} has no training frame with an opaque pixel"
+            )
+    return frames
+
+
+def new_avatar(collection: Collection, frames: list[Frame], config: Config) -> Avatar:
+    """An untrained avatar whose space is carved by the mattes of the frames."""
+    head = collection.head
+    canonical = head.canonical(collection.betas)
+    corner, size = hull_box(canonical, head.triangles, frames, config.reach)
+    occupied = np.stack(
+        [
+            carve(
+                canonical,
+                head.triangles,
+                [f for f in frames if f.appearance == index],
+                config.reach,
+                corner,
+                size,
+                config.occupancy_resolution,
+            )
+            for index in range(len(collection.appearances))
+        ]
+    )
+    return Avatar.create(
+        config,
+        collection.appearances,
+        canonical,
+        head.triangles,
+        head.uvs,
+        head.uv_triangles,
+        head.expression_names,
+        rigid_weights=rigid_weights(head.regions, len(canonical)),
+        box_min=corner,
+        box_size=size,
+        occupied=occupied,
+        head_name=collection.head_name,
+        head_fingerprint=head.fingerprint,
+        betas=collection.betas,
+        record={
+            "frames": {
+                name: sum(f.appearance == index for f in frames)
+                for index, name in enumerate(collection.appearances)
+            }
+        },
+    )
+
+
+def rigid_weights(regions: dict[str, np.ndarray], vertices: int) -> np.ndarray:
+    """1 for vertices that move with the skull, as far as the regions tell; else all 1."""
+    weights = np.zeros(vertices, np.float32)
+    for name in ("scalp", "ears"):
+        if name in regions:
+            weights[regions[name]] = 1
+    return weights if weights.sum() >= 3 else np.ones(vertices, np.float32)

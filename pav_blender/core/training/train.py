@@ -1,0 +1,93 @@
+"""Training from a collection to a `.pav` file, with checkpoints, cancel and resume."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from ..collection import Collection, read_collection
+from ..config import Config
+from ..errors import Cancelled, InputError
+from ..field.avatar import Avatar
+from ..progress import Report
+from .checkpoint import checkpoint_path, load_checkpoint, save_checkpoint
+from .prepare import load_training_frames, new_avatar
+from .trainer import Trainer
+
+_CHECKPOINT_SECONDS = 30.0
+
+
+def train(
+    collection: Collection | Path | str,
+    out: Path | str,
+    config: Config | None = None,
+    *,
+    minutes: float | None = None,
+    resume: bool = False,
+    progress: Report | None = None,
+    loading: Report | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> Avatar:
+    """Trains an avatar on the "train" frames of a collection and writes it to `out`.
+
+    minutes: plan for this much time in the loop instead of `config.iterations`. A checkpoint is
+    kept beside `out` while the work goes on; `resume=True` continues from it. Raises Cancelled
+    (the checkpoint stays) when `should_stop()`, InputError for bad input.
+    """
+    if not isinstance(collection, Collection):
+        collection = read_collection(collection)
+    if minutes is not None and not minutes > 0:
+        raise InputError(f"--minutes {minutes}: above 0")
+    out = Path(out)
+    if out.suffix != ".pav":
+        raise InputError(f"{out}: an avatar file ends in .pav")
+    saved = checkpoint_path(out)
+    if resume and not saved.is_file():
+        raise InputError(f"{saved}: no checkpoint to resume from")
+    frames = load_training_frames(collection, loading)
+    source = fingerprint(collection)
+    trainer = Trainer(
+        new_avatar(collection, frames, config or Config()), frames, minutes=minutes
+    )
+    if resume:
+        load_checkpoint(saved, trainer, source)
+    last_saved = time.monotonic()
+    while trainer.done < 1:
+        status = trainer.iterate()
+        if progress:
+            progress(
+                trainer.done,
+                iteration=status.iteration,
+                loss=round(status.loss, 4),
+                psnr=round(status.psnr, 2),
+                samples_per_ray=round(status.samples_per_ray, 1),
+            )
+        stopping = should_stop is not None and should_stop()
+        if stopping or time.monotonic() - last_saved > _CHECKPOINT_SECONDS:
+            save_checkpoint(saved, trainer, source)
+            last_saved = time.monotonic()
+        if stopping:
+            raise Cancelled(f"training was stopped; `--resume` goes on from {saved}")
+    avatar = trainer.avatar
+    avatar.record |= {
+        "iterations": trainer.status.iteration,
+        "seconds": round(trainer.status.seconds, 1),
+        "batch_psnr": round(trainer.status.psnr, 2),
+        "collection": source,
+    }
+    avatar.save(out)
+    saved.unlink(missing_ok=True)
+    return avatar
+
+
+def fingerprint(collection: Collection) -> str:
+    """Short hash of what a training reads: tracks, splits and the pictures' names."""
+    digest = hashlib.sha256(collection.head.fingerprint.encode())
+    digest.update(collection.betas.tobytes())
+    for clip in collection.clips:
+        digest.update(f"{clip.name}/{clip.appearance}/{clip.width}x{clip.height}".encode())
+        for array in (clip.expression, clip.pose, clip.translation, clip.frame_id, clip.split):
+            digest.update(array.tobytes())
+    return digest.hexdigest()[:16]

@@ -1,0 +1,159 @@
+"""The training loop: rays of a few frames, a step of Adam, and less and less empty space."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from .. import kernels
+from ..config import Config
+from ..deformation import Deformer
+from ..field.avatar import Avatar
+from .batches import Poses, draw_pixels, pick_samples
+from .frames import Frame
+from .losses import Loss, losses
+from .occupancy import Visibility
+
+_FIRST_STEP = 3.0  # the first samples are this many times as far apart as the last
+_REFINED = 0.15  # part of the schedule after which the step is fine
+_PRUNE_FROM = 200
+_PRUNE_EVERY = 100
+_WARM_UP = 50
+
+
+@dataclass
+class Status:
+    """Where training stands: smoothed loss and PSNR of the batches, samples a ray."""
+
+    iteration: int = 0
+    seconds: float = 0.0
+    loss: float = 0.0
+    psnr: float = 0.0
+    samples_per_ray: float = 0.0
+    filled: float = 1.0
+
+
+class Trainer:
+    """Holds what changes while an avatar learns. `minutes` plans the schedule by the clock."""
+
+    def __init__(
+        self, avatar: Avatar, frames: list[Frame], *, minutes: float | None = None
+    ) -> None:
+        self.avatar = avatar
+        self.frames = frames
+        self.minutes = minutes
+        self.config: Config = avatar.config
+        self.status = Status()
+        self.random = np.random.default_rng(self.config.seed)
+        self.generator = torch.Generator().manual_seed(self.config.seed)
+        self.visibility = Visibility(avatar.occupied, avatar.box_min, avatar.box_size)
+        deformer = Deformer(avatar.canonical_vertices, avatar.triangles, self.config.frames)
+        self._poses = Poses(deformer, avatar.canonical_vertices, avatar.rigid_weights)
+        self._by_appearance = [
+            [f for f in frames if f.appearance == a] for a in range(len(avatar.appearances))
+        ]
+        self.moments = {
+            name: (torch.zeros_like(p), torch.zeros_like(p))
+            for name, p in avatar.field.named_parameters()
+        }
+        for parameter in avatar.field.parameters():
+            parameter.grad = torch.zeros_like(parameter)
+        self._mse = math.nan
+
+    @property
+    def done(self) -> float:
+        """Part of the schedule that lies behind, in [0, 1]."""
+        if self.minutes is not None:
+            return min(1.0, self.status.seconds / (60 * self.minutes))
+        return min(1.0, self.status.iteration / self.config.iterations)
+
+    def iterate(self) -> Status:
+        """One iteration: batch, loss, backward, Adam; the occupancy now and then."""
+        started = time.monotonic()
+        config, status = self.config, self.status
+        pixels = draw_pixels(self._choose_frames(), config.rays, self.random)
+        count = len(pixels.rays)
+        step = config.step * self._coarseness()
+        jitter = torch.rand(count, generator=self.generator)
+        with torch.no_grad():
+            picked = pick_samples(
+                self.avatar.field,
+                self._poses,
+                pixels,
+                self.visibility.spaces,
+                config.reach,
+                step,
+                jitter,
+            )
+            self.visibility.watch(picked.cells, picked.transmittance, picked.weights)
+        ops = kernels.select("cpu")
+        sigma, rgb = self.avatar.field(picked.samples)
+        colour, opacity, depth, _ = ops.marching.composite(
+            sigma, rgb, picked.t, step, picked.samples.ray, count
+        )
+        background = torch.rand(count, 3, generator=self.generator)
+        loss = losses(config, pixels, background, colour, opacity, depth)
+        if torch.isfinite(loss.total):
+            loss.total.backward()
+            self._adam()
+        status.iteration += 1
+        if status.iteration >= _PRUNE_FROM and status.iteration % self._prune_every() == 0:
+            status.filled = self.visibility.prune()
+        self._note(loss, len(picked.t) / max(count, 1))
+        status.seconds += time.monotonic() - started
+        return status
+
+    def _choose_frames(self) -> list[Frame]:
+        """Frames of a batch: appearances in turn, frames at random."""
+        groups = [group for group in self._by_appearance if group]
+        offset = int(self.random.integers(len(groups)))
+        return [
+            group[self.random.integers(len(group))]
+            for group in (
+                groups[(offset + i) % len(groups)] for i in range(self.config.frames_per_batch)
+            )
+        ]
+
+    def _coarseness(self) -> float:
+        return max(1.0, _FIRST_STEP * (1 / _FIRST_STEP) ** min(1.0, self.done / _REFINED))
+
+    def _prune_every(self) -> int:
+        return _PRUNE_EVERY if self.status.iteration < 10 * _PRUNE_EVERY else 5 * _PRUNE_EVERY
+
+    def _adam(self) -> None:
+        config = self.config
+        ops = kernels.select("cpu")
+        step = self.status.iteration + 1
+        decay = config.final_learning_rate**self.done * min(1.0, step / _WARM_UP)
+        for name, parameter in self.avatar.field.named_parameters():
+            base = (
+                config.offset_learning_rate if name.startswith("offset") else config.learning_rate
+            )
+            m, v = self.moments[name]
+            settings = {
+                "step": step,
+                "lr": base * decay,
+                "beta1": config.beta1,
+                "beta2": config.beta2,
+                "eps": config.epsilon,
+            }
+            if parameter.numel() == 0:
+                continue
+            if name == "latent" and config.appearance == "surface":
+                rows = [x.view(-1, x.shape[-1]) for x in (parameter.data, parameter.grad, m, v)]
+                ops.optimiser.sparse_adam_step(*rows, **settings)
+            else:
+                ops.optimiser.adam_step(parameter.data, parameter.grad, m, v, **settings)
+
+    def _note(self, loss: Loss, samples: float) -> None:
+        status = self.status
+        fresh = math.isnan(self._mse)
+        keep = 0.0 if fresh else 0.98
+        self._mse = loss.mse if fresh else keep * self._mse + (1 - keep) * loss.mse
+        status.loss = keep * status.loss + (1 - keep) * float(loss.total.detach())
+        status.samples_per_ray = keep * status.samples_per_ray + (1 - keep) * samples
+        status.psnr = -10 * math.log10(max(self._mse, 1e-10))
