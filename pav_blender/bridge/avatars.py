@@ -1,0 +1,72 @@
+"""Avatar files as Blender sees them: resolved paths, names for menus, loaded models kept."""
+
+from __future__ import annotations
+
+import zlib
+from collections import OrderedDict
+from pathlib import Path
+from typing import Any
+
+from ..core.errors import InputError
+
+_KEPT = 4
+_loaded: OrderedDict[tuple[str, int, int], Any] = OrderedDict()
+_headers: dict[str, tuple[tuple[str, int, int], dict[str, Any]]] = {}
+
+
+def _identity(path: Path) -> tuple[str, int, int]:
+    try:
+        status = path.stat()
+    except OSError as error:
+        raise InputError(f"{path}: no such avatar file") from error
+    return str(path), status.st_mtime_ns, status.st_size
+
+
+def resolve(stored: str, library: Any | None = None) -> Path:
+    """The file that a stored path ("//" starts at the .blend, or at the linked library) names."""
+    import bpy
+
+    if stored.startswith("//") and not (library.filepath if library else bpy.data.filepath):
+        raise InputError(
+            f"avatar file {stored!r} is relative to the .blend, which was never saved; save it "
+            "or choose the avatar again"
+        )
+    return Path(bpy.path.abspath(stored, library=library))
+
+
+def load(path: Path) -> Any:
+    """The `Avatar` in a file; read again only when the file changed. InputError, one line."""
+    from ..core.field.avatar import Avatar
+
+    key = _identity(path)
+    if key not in _loaded:
+        _loaded[key] = Avatar.load(path)
+        while len(_loaded) > _KEPT:
+            _loaded.popitem(last=False)
+    _loaded.move_to_end(key)
+    return _loaded[key]
+
+
+def header(path: Path) -> dict[str, Any]:
+    """The header of an avatar file, cached. InputError, one line."""
+    from ..core.field.avatar import read_header
+
+    key = _identity(path)
+    known = _headers.get(str(path))
+    if known is None or known[0] != key:
+        _headers[str(path)] = known = (key, read_header(path))
+    return known[1]
+
+
+def forget() -> None:
+    """Drops every loaded model."""
+    _loaded.clear()
+    _headers.clear()
+
+
+def number(name: str) -> int:
+    """The number of an appearance in menus and keyframes: the same for a name in every avatar.
+
+    Below 2^24, so that a keyframe (float32) holds it exactly; never 0, which is "not chosen".
+    """
+    return (zlib.crc32(name.encode()) & 0xFFFFFF) or 1

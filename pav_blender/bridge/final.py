@@ -1,0 +1,87 @@
+"""The final render (F12, `-a`): what the engine class calls."""
+
+from __future__ import annotations
+
+import os
+import sys
+import traceback
+from typing import Any
+
+import bpy
+import numpy as np
+
+from ..core.errors import Cancelled, PavError
+from . import requirements
+from .render import Pixels, draw
+from .shot import Shot, read_shot
+
+_asked: list[str] = []  # the scene whose render was asked for, from start to end
+
+
+def render(engine: Any, depsgraph: Any) -> None:
+    """Renders one view layer into `engine`; every failure is reported, so that a farm stops.
+
+    Only `report({"ERROR"})` with nothing written makes `-a` end with code 1.
+    """
+    try:
+        requirements.check()
+        shot = read_shot(engine, depsgraph)
+        engine.update_stats("", f"PAV: {shot.width}x{shot.height}")
+        pixels = draw(shot, engine.update_progress, engine.test_break)
+    except Cancelled:
+        return
+    except Exception as error:
+        if not isinstance(error, PavError):
+            traceback.print_exc()
+            error = PavError(f"{type(error).__name__}: {error} (a fault of PAV, see the console)")
+        _fail(engine, depsgraph, str(error))
+        return
+    _write(engine, depsgraph.view_layer_eval, shot, pixels)
+
+
+def _write(engine: Any, layer: Any, shot: Shot, pixels: Pixels) -> None:
+    x0, y0, x1, y1 = shot.region
+    result = engine.begin_result(0, 0, x1 - x0, y1 - y0, layer=layer.name)
+    passes = result.layers[0].passes
+    for name, picture in (("Combined", pixels.combined), ("Depth", pixels.depth)):
+        target = passes.find_by_name(name, "")
+        if target is not None:
+            flipped = np.ascontiguousarray(picture[::-1], np.float32)  # row 0 at the bottom
+            target.rect.foreach_set(flipped.ravel())
+    engine.end_result(result)
+
+
+def _fail(engine: Any, depsgraph: Any, message: str) -> None:
+    scene = depsgraph.scene_eval
+    where = f"frame {scene.frame_current}: {message}"
+    engine.report({"ERROR"}, f"PAV: {where}")
+    nested = bool(_asked) and _asked[-1] != scene.name
+    if nested and bpy.app.background:
+        # Blender would go on, write the outer scene without the avatar and end with code 0
+        print(f"Error: PAV: {where} (scene {scene.name!r} inside {_asked[-1]!r})", file=sys.stderr)
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(1)
+
+
+@bpy.app.handlers.persistent
+def _started(scene: Any, *_rest: Any) -> None:
+    _asked[:] = [scene.name]
+
+
+@bpy.app.handlers.persistent
+def _ended(*_rest: Any) -> None:
+    _asked.clear()
+
+
+def register() -> None:
+    bpy.app.handlers.render_init.append(_started)
+    bpy.app.handlers.render_complete.append(_ended)
+    bpy.app.handlers.render_cancel.append(_ended)
+
+
+def unregister() -> None:
+    bpy.app.handlers.render_cancel.remove(_ended)
+    bpy.app.handlers.render_complete.remove(_ended)
+    bpy.app.handlers.render_init.remove(_started)
+    _ended()

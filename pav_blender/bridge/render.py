@@ -1,0 +1,132 @@
+"""A shot to pixels. No bpy here, so it may run on any thread."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..core.errors import InputError
+from . import avatars
+from .shot import Actor, Shot
+
+FAR = 1e10  # Blender's depth where nothing is
+
+
+@dataclass(frozen=True, eq=False)
+class Pixels:
+    """combined [H, W, 4] scene-linear premultiplied; depth [H, W] metres along the camera's
+    axis, FAR where empty; display [H, W, 4] straight sRGB. Row 0 is the top."""
+
+    combined: np.ndarray
+    depth: np.ndarray
+    display: np.ndarray
+
+
+def draw(
+    shot: Shot,
+    progress: Callable[[float], None] | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> Pixels:
+    """Renders every actor of a shot, nearer over farther. Raises PavError, one line;
+    Cancelled where `should_stop` said so."""
+    count = len(shot.actors)
+    layers = []
+    for index, actor in enumerate(shot.actors):
+        layers.append(_draw_actor(shot, actor, _part(progress, index, count), should_stop))
+    display, depth = _stack(layers)
+    combined = to_linear(display)
+    if shot.background is not None:
+        combined[..., :3] += (1 - combined[..., 3:]) * np.asarray(shot.background, np.float32)
+        combined[..., 3] = 1.0
+    return Pixels(combined, depth, display)
+
+
+def expression_vector(actor: Actor, names: tuple[str, ...]) -> np.ndarray:
+    """Shape key values in the avatar's order, [E] float32; a key that the mesh lacks counts 0.
+
+    InputError where the mesh has keys but none that the avatar knows: the head is another one.
+    """
+    if actor.expression and names and not set(actor.expression) & set(names):
+        raise InputError(
+            f"object {actor.name!r}: none of its shape keys is an expression of {actor.avatar} "
+            f"({names[0]}, ...): its head is another one"
+        )
+    return np.array([actor.expression.get(name, 0.0) for name in names], np.float32)
+
+
+def check_topology(actor: Actor, avatar: Any) -> None:
+    """InputError unless the mesh is the avatar's head."""
+    found, expected = len(actor.vertices), len(avatar.canonical_vertices)
+    if found != expected:
+        raise InputError(
+            f"object {actor.name!r} has {found} vertices, the head of {actor.avatar} has "
+            f"{expected}: use that head's mesh, and no modifier that adds or removes vertices"
+        )
+    if not np.array_equal(actor.triangles, avatar.triangles):
+        raise InputError(
+            f"object {actor.name!r}: its faces are not those of the head of {actor.avatar}; "
+            "use that head's mesh"
+        )
+
+
+def _draw_actor(
+    shot: Shot,
+    actor: Actor,
+    progress: Callable[[float], None] | None,
+    should_stop: Callable[[], bool] | None,
+) -> tuple[np.ndarray, np.ndarray]:
+    from ..core.rendering.render import RenderSettings, render
+
+    avatar = avatars.load(actor.avatar)
+    check_topology(actor, avatar)
+    picture = render(
+        avatar,
+        actor.vertices,
+        actor.camera,
+        actor.appearance or avatar.appearances[0],
+        RenderSettings.preset(shot.quality),
+        region=shot.region,
+        progress=progress,
+        should_stop=should_stop,
+        expression=expression_vector(actor, avatar.expression_names),
+    )
+    depth = np.where(np.isfinite(picture.depth), picture.depth * actor.scale, FAR)
+    return np.asarray(picture.rgba, np.float32), depth.astype(np.float32)
+
+
+def _part(
+    progress: Callable[[float], None] | None, index: int, count: int
+) -> Callable[[float], None] | None:
+    if progress is None:
+        return None
+    return lambda fraction: progress((index + fraction) / count)
+
+
+def _stack(layers: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """Straight pictures with depths -> one, each pixel's nearer layer over the farther."""
+    if len(layers) == 1:
+        return layers[0]
+    order = np.argsort([depth for _, depth in layers], axis=0, kind="stable")
+    colour = np.zeros_like(layers[0][0])
+    for rank in reversed(range(len(layers))):
+        for index, (rgba, _) in enumerate(layers):
+            chosen = order[rank] == index
+            alpha = rgba[chosen, 3:]
+            premultiplied = np.concatenate([rgba[chosen, :3] * alpha, alpha], axis=1)
+            colour[chosen] = premultiplied + (1 - alpha) * colour[chosen]
+    alpha = colour[..., 3:]
+    colour[..., :3] /= np.where(alpha > 0, alpha, 1)
+    return colour, np.min([depth for _, depth in layers], axis=0)
+
+
+def to_linear(display: np.ndarray) -> np.ndarray:
+    """Straight sRGB [H, W, 4] -> scene-linear premultiplied, what Blender's Combined holds."""
+    linear = np.empty_like(display, dtype=np.float32)
+    colour = np.clip(display[..., :3], 0, 1)
+    linear[..., :3] = np.where(colour <= 0.04045, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4)
+    linear[..., 3] = np.clip(display[..., 3], 0, 1)
+    linear[..., :3] *= linear[..., 3:]
+    return linear

@@ -1,0 +1,260 @@
+"""A scene that shows an avatar moving as a clip moved; `pav scene`."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..core.errors import InputError
+from .lens import from_intrinsics
+
+ENGINE = "PAV"
+
+
+@dataclass
+class SceneObjects:
+    """What `build_scene` made."""
+
+    mesh: Any
+    armature: Any
+    camera: Any
+
+
+def build_head(avatar_path: Path, appearance: str | None = None) -> Any:
+    """Adds the head of an avatar to the current scene, at rest: a `rig.Rig` with its properties.
+
+    InputError where the avatar, its head model or the appearance is wrong.
+    """
+    import bpy
+
+    from ..core.head import load_head
+    from . import avatars
+    from .rig import build_rig
+
+    avatar = avatars.load(avatar_path)
+    head = load_head(avatar.head_name)
+    if avatar.head_fingerprint and head.fingerprint != avatar.head_fingerprint:
+        raise InputError(
+            f"{avatar_path}: made with another version of the head {avatar.head_name!r}; "
+            "train it again with this one"
+        )
+    rig = build_rig(head, avatar.betas, avatar_path.stem, bpy.context.scene.collection)
+    rig.mesh.pav.avatar = stored_path(avatar_path, bpy.data.filepath)
+    choose_appearance(rig.mesh, avatar.appearances, appearance)
+    return rig
+
+
+def choose_appearance(mesh: Any, known: list[str], name: str | None) -> None:
+    """Sets the appearance of a head object; the avatar's first for None."""
+    name = name or known[0]
+    if name not in known:
+        raise InputError(f"unknown appearance {name!r}; the avatar has {', '.join(known)}")
+    mesh.pav.appearance = name
+
+
+def stored_path(path: Path, blend: str) -> str:
+    """`path` relative to a saved .blend ("//..."), so that both can move together; else absolute.
+
+    Also absolute where no relative path exists (another drive on Windows).
+    """
+    path = path.resolve()
+    if not blend:
+        return str(path)
+    try:
+        relative = os.path.relpath(path, Path(blend).resolve().parent)
+    except ValueError:
+        return str(path)
+    return "//" + relative.replace(os.sep, "/")
+
+
+def import_track(mesh: Any, collection: Any, clip_name: str, fps: float | None = None) -> Any:
+    """Animates a head object and the scene's camera as in a clip of a `Collection`; returns the
+    camera object.
+
+    The scene's frame numbers are the clip's own (`frame_id`); frames of held-out cameras are left
+    out; between frames everything is linear. Sets the scene's range, size and, if given, rate.
+    """
+    import bpy
+
+    from .motion import Motion, apply_camera, apply_motion
+    from .rig import find_armature
+
+    scene = bpy.context.scene
+    clip = collection.clip(clip_name)
+    armature = find_armature(mesh)
+    keys = mesh.data.shape_keys
+    head = collection.head
+    lacking = [n for n in head.expression_names if keys is None or n not in keys.key_blocks]
+    if armature is None or lacking:
+        what = f"shape key {lacking[0]!r}" if lacking else "armature"
+        raise InputError(
+            f"object {mesh.name!r} has no {what}: clip {clip_name!r} moves the head "
+            f"{collection.head_name!r}; import that clip's avatar first"
+        )
+    rows = _rows(clip)
+    frames = clip.frame_id[rows].astype(np.float64)
+    motion = Motion(clip.expression[rows], clip.pose[rows], clip.translation[rows], frames)
+    apply_motion(mesh, armature, head.expression_names, head.joint_names, motion)
+    lenses = [from_intrinsics(k, clip.width, clip.height) for k in clip.intrinsics[rows]]
+    camera = scene.camera or _new_camera(scene)
+    camera.data.type, camera.data.sensor_fit = "PERSP", lenses[0].sensor_fit
+    camera.data.sensor_width = lenses[0].sensor_width
+    apply_camera(camera, frames, clip.camera_to_world[rows], lenses)
+    render = scene.render
+    render.resolution_x, render.resolution_y = clip.width, clip.height
+    render.resolution_percentage = 100
+    render.pixel_aspect_x, render.pixel_aspect_y = lenses[0].aspect_x, lenses[0].aspect_y
+    scene.frame_start, scene.frame_end = int(frames[0]), int(frames[-1])
+    if fps is not None:
+        render.fps, render.fps_base = _rate(fps)
+    scene.frame_set(scene.frame_start)
+    return camera
+
+
+def use_engine(scene: Any) -> None:
+    """Settings under which the avatar's colours reach the file as they were learned."""
+    scene.render.engine = ENGINE
+    scene.render.film_transparent = True
+    scene.render.dither_intensity = 0.0
+    scene.render.image_settings.file_format = "PNG"
+    scene.render.image_settings.color_mode = "RGBA"
+    scene.render.image_settings.color_depth = "8"
+    scene.display_settings.display_device = "sRGB"
+    view = scene.view_settings
+    view.view_transform, view.look = "Standard", "None"
+    view.exposure, view.gamma, view.use_curve_mapping = 0.0, 1.0, False
+
+
+def build_scene(
+    avatar_path: Path,
+    collection: Any,
+    clip_name: str,
+    *,
+    appearance: str | None = None,
+    fps: float | None = None,
+) -> SceneObjects:
+    """Adds to the current scene an avatar that moves as a clip of a `Collection`, with the clip's
+    camera, size and frames, ready to render. InputError where they do not fit together."""
+    import bpy
+
+    from . import avatars
+
+    avatar = avatars.load(avatar_path)
+    if avatar.head_fingerprint and collection.head.fingerprint != avatar.head_fingerprint:
+        raise InputError(
+            f"{collection.path} moves the head {collection.head_name!r}, {avatar_path} has "
+            f"{avatar.head_name!r}: use clips of the same head"
+        )
+    collection.clip(clip_name)  # a wrong name is told before anything is built
+    rig = build_head(avatar_path, appearance)
+    camera = import_track(rig.mesh, collection, clip_name, fps)
+    use_engine(bpy.context.scene)
+    return SceneObjects(rig.mesh, rig.armature, camera)
+
+
+def _rows(clip: Any) -> np.ndarray:
+    """Rows of the clip's own camera by rising frame number; all, where there are no others."""
+    rows = clip.indices("train", "test")
+    if len(rows) == 0:
+        rows = np.arange(len(clip))
+    return rows[np.argsort(clip.frame_id[rows], kind="stable")]
+
+
+def _new_camera(scene: Any) -> Any:
+    import bpy
+
+    camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
+    camera.data.clip_start = 0.01
+    scene.collection.objects.link(camera)
+    scene.camera = camera
+    return camera
+
+
+def _rate(fps: float) -> tuple[int, float]:
+    """Blender's whole rate and its divisor, as 29.97 = 30 / 1.001."""
+    whole = max(1, round(fps))
+    return whole, whole / fps
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("avatar", type=Path, metavar="AVATAR", help="the avatar file (.pav)")
+    parser.add_argument(
+        "--track",
+        required=True,
+        metavar="COLLECTION:CLIP",
+        help="the clip whose motion and camera the scene gets",
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE.blend")
+    parser.add_argument("--appearance", metavar="NAME", help="default: the avatar's first")
+    parser.add_argument("--fps", type=float, default=25.0, help="frames a second (default 25)")
+
+
+def parse_track(text: str) -> tuple[Path, str]:
+    """`COLLECTION:CLIP` -> both; the last colon divides."""
+    folder, colon, clip = text.rpartition(":")
+    if not (folder and colon and clip):
+        raise InputError(f"--track {text!r}: expected COLLECTION:CLIP")
+    return Path(folder), clip
+
+
+def run(args: argparse.Namespace) -> int:
+    """`pav scene`: builds the scene in an empty file and saves it, whole or not at all."""
+    from ..core.collection import read_collection
+
+    if args.out.suffix != ".blend":
+        raise InputError(f"--out {args.out}: a Blender file ends in .blend")
+    if not args.out.resolve().parent.is_dir():
+        raise InputError(f"--out {args.out}: no such folder")
+    if not args.fps > 0:
+        raise InputError(f"--fps {args.fps}: above 0")
+    folder, clip = parse_track(args.track)
+    collection = read_collection(folder)
+    with _blender():
+        made = build_scene(args.avatar, collection, clip, appearance=args.appearance, fps=args.fps)
+        made.mesh.pav.avatar = stored_path(args.avatar, str(args.out))
+        save_copy(args.out)
+    print(f"{args.out}: {clip}, {len(collection.clip(clip))} frames", file=sys.stderr, flush=True)
+    return 0
+
+
+def save_copy(path: Path) -> None:
+    """Saves the open file as `path` through a temporary name beside it."""
+    import bpy
+
+    temporary = path.resolve().with_name(f".{path.stem}.partial-{os.getpid()}.blend")
+    try:
+        bpy.ops.wm.save_as_mainfile(filepath=str(temporary), copy=True, compress=True)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+class _blender:
+    """An empty Blender file with the add-on registered; on the bpy wheel it is unregistered on
+    the way out, for a class left registered hangs or crashes that process at its end."""
+
+    def __enter__(self) -> None:
+        try:
+            import bpy
+        except ImportError as error:
+            raise InputError(
+                "`pav scene` needs Blender: `blender --command pav scene ...`, or `pip install bpy`"
+            ) from error
+        from .. import register
+
+        bpy.ops.wm.read_homefile(use_factory_startup=True, use_empty=True)
+        self.registered = not hasattr(bpy.types.Object, "pav")
+        if self.registered:
+            register()
+
+    def __exit__(self, *_error: object) -> None:
+        from .. import unregister
+
+        if self.registered:
+            unregister()

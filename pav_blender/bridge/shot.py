@@ -1,0 +1,178 @@
+"""What one picture needs, copied out of Blender: after this, drawing knows no bpy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..core.errors import InputError
+from ..core.rendering.cameras import Camera
+from . import avatars, mesh
+from .axes import camera_to_core
+from .lens import frame_size, from_projection
+
+
+@dataclass(frozen=True, eq=False)
+class Actor:
+    """A head to draw. vertices [V, 3] float32 metres and camera in the head's own space (see
+    `mesh.placement`); scale: world metres in a metre of that space; expression: shape key values
+    by name; triangles [T, 3] for the check against the avatar."""
+
+    name: str
+    avatar: Path
+    appearance: str | None
+    vertices: np.ndarray
+    triangles: np.ndarray
+    expression: dict[str, float]
+    camera: Camera
+    scale: float
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """One picture: `region` (x0, y0, x1, y1) of a width x height frame, top-left origin; quality
+    a preset's name; background scene-linear RGB, None for a transparent film."""
+
+    actors: tuple[Actor, ...]
+    width: int
+    height: int
+    region: tuple[int, int, int, int]
+    quality: str
+    background: tuple[float, float, float] | None
+
+
+def border(render: Any, width: int, height: int) -> tuple[int, int, int, int]:
+    """The pixels that the render border keeps, (x0, y0, x1, y1) from the top left."""
+    if not render.use_border:
+        return 0, 0, width, height
+    # float32 products cut off, as Blender computes the same rectangle
+    left, right = (
+        int(np.float32(v) * np.float32(width)) for v in (render.border_min_x, render.border_max_x)
+    )
+    low, high = (
+        int(np.float32(v) * np.float32(height)) for v in (render.border_min_y, render.border_max_y)
+    )
+    if right <= left or high <= low:
+        raise InputError("the render border holds no pixel; draw it again or switch it off")
+    return left, height - high, right, height - low
+
+
+def world_colour(world: Any) -> tuple[float, float, float]:
+    """Scene-linear colour behind the avatar: the world's background colour, black without one."""
+    if world is None:
+        return 0.0, 0.0, 0.0
+    nodes = world.node_tree.nodes if world.use_nodes and world.node_tree else ()
+    for node in nodes:
+        if node.type == "BACKGROUND" and not node.inputs["Color"].is_linked:
+            strength = node.inputs["Strength"].default_value
+            return tuple(strength * channel for channel in node.inputs["Color"].default_value[:3])
+    return tuple(world.color)
+
+
+def scene_camera(engine: Any, camera: Any, depsgraph: Any, width: int, height: int) -> Camera:
+    """The camera of a final render in world space, core axes.
+
+    `engine` is the render engine (it knows the matrix to use), or None outside a render.
+    """
+    render = depsgraph.scene.render
+    projection = np.array(
+        camera.calc_matrix_camera(
+            depsgraph,
+            x=width,
+            y=height,
+            scale_x=render.pixel_aspect_x,
+            scale_y=render.pixel_aspect_y,
+        )
+    )
+    if engine is not None:
+        matrix = np.array(engine.camera_model_matrix(camera))
+    else:
+        matrix = np.array(camera.matrix_world)
+    intrinsics = from_projection(projection, width, height)
+    return Camera(width, height, intrinsics, camera_to_core(matrix))
+
+
+def find_actors(depsgraph: Any, camera: Camera) -> tuple[Actor, ...]:
+    """Every visible object (or instance of one) that has an avatar file, ready to draw."""
+    actors = []
+    for instance in depsgraph.object_instances:
+        evaluated = instance.object
+        if evaluated.type == "MESH" and evaluated.pav.avatar and instance.show_self:
+            actors.append(read_actor(evaluated, instance.matrix_world, depsgraph, camera))
+    return tuple(actors)
+
+
+def read_actor(evaluated: Any, matrix_world: Any, depsgraph: Any, camera: Camera) -> Actor:
+    """One evaluated mesh object as an actor seen by `camera` (world space)."""
+    original = evaluated.original
+    try:
+        rigid, stretch, scale = mesh.placement(np.array(matrix_world))
+    except ValueError as error:
+        raise InputError(f"object {original.name!r}: {error}") from error
+    pose = np.linalg.inv(rigid) @ camera.camera_to_world
+    pose[:3, 3] /= scale
+    points = mesh.evaluated_vertices(evaluated)
+    if not np.allclose(stretch, np.eye(3), atol=1e-6):
+        points = np.ascontiguousarray(points @ stretch.T, np.float32)
+    return Actor(
+        name=original.name,
+        avatar=avatars.resolve(evaluated.pav.avatar, original.library),
+        appearance=_appearance(evaluated.pav, original.name),
+        vertices=points,
+        triangles=mesh.triangles(evaluated.data),
+        expression=_key_values(original, depsgraph),
+        camera=replace(camera, camera_to_world=pose),
+        scale=scale,
+    )
+
+
+def read_shot(engine: Any, depsgraph: Any) -> Shot:
+    """The picture that a final render of `depsgraph` asks for. InputError, one line."""
+    scene = depsgraph.scene_eval
+    camera_object = scene.camera
+    if camera_object is None:
+        raise InputError(f"scene {scene.name!r} has no camera; add one or import a track")
+    if scene.render.use_multiview:
+        raise InputError("PAV renders one view; switch stereoscopy off")
+    width, height = frame_size(scene.render)
+    camera = scene_camera(engine, camera_object, depsgraph, width, height)
+    actors = find_actors(depsgraph, camera)
+    if not actors:
+        raise InputError(
+            f"scene {scene.name!r} shows no avatar: choose an avatar file for a head in the "
+            "sidebar's PAV tab, and check that the head is visible in renders"
+        )
+    background = None if scene.render.film_transparent else world_colour(scene.world)
+    return Shot(
+        actors,
+        width,
+        height,
+        border(scene.render, width, height),
+        depsgraph.scene.pav.quality.lower(),
+        background,
+    )
+
+
+def _appearance(pav: Any, name: str) -> str | None:
+    """The chosen appearance; None where none was ever chosen (the avatar's first then)."""
+    if not pav.is_property_set("appearance"):
+        return None
+    if pav.appearance:
+        return pav.appearance
+    path = avatars.resolve(pav.avatar, pav.id_data.library)
+    known = ", ".join(avatars.header(path)["appearances"])
+    raise InputError(
+        f"object {name!r}: the appearance chosen there is not in {path}; it has {known}"
+    )
+
+
+def _key_values(original: Any, depsgraph: Any) -> dict[str, float]:
+    """Evaluated (animated, driven) values of an object's shape keys; a muted key counts 0."""
+    keys = original.data.shape_keys
+    if keys is None:
+        return {}
+    blocks = keys.evaluated_get(depsgraph).key_blocks
+    return {key.name: 0.0 if key.mute else key.value for key in blocks[1:]}

@@ -1,0 +1,15 @@
+"""Operators: a few lines each over `bridge`."""
+
+from . import avatar, jobs
+
+modules = (avatar, jobs)
+
+
+def register() -> None:
+    for module in modules:
+        module.register()
+
+
+def unregister() -> None:
+    for module in reversed(modules):
+        module.unregister()

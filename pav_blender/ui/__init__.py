@@ -1,0 +1,5 @@
+"""Panels and preferences."""
+
+from . import panels
+
+register, unregister = panels.register, panels.unregister
