@@ -1,0 +1,158 @@
+"""Video files to pictures, one at a time, upright and with square pixels."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError
+
+_COVER_PICTURE = 0x400  # libavformat's AV_DISPOSITION_ATTACHED_PIC
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """number: its place in the video from 0; rgb: uint8 [H, W, 3]."""
+
+    number: int
+    rgb: np.ndarray
+
+
+@dataclass
+class Video:
+    """An opened description of a video; `frames` reads it anew each time.
+
+    rate: frames a second (0 where the file does not say); count: frames as the file declares them
+    (0: unknown); warnings: one line for each thing that could not be decoded.
+    """
+
+    path: Path
+    rate: float
+    count: int
+    warnings: list[str] = field(default_factory=list)
+
+    def frames(self, every: int = 1, max_frames: int | None = None) -> Iterator[Frame]:
+        """Yields every `every`-th frame, `max_frames` at most.
+
+        What is damaged is passed over and told in `warnings`; a file in which nothing can be
+        decoded raises InputError.
+        """
+        given, number, skipped = 0, 0, 0
+        ended_early = False
+        size: tuple[int, ...] | None = None
+        with _open(self.path) as container:
+            stream = _video_stream(container, self.path)
+            ratio = _pixel_aspect(stream)
+            packets = _packets(container, stream)
+            for packet in packets:
+                if packet is None:
+                    ended_early = True
+                    break
+                for picture in _decoded(packet):
+                    if picture is None:
+                        skipped += 1
+                        continue
+                    wanted = number % every == 0
+                    number += 1
+                    if not wanted:
+                        continue
+                    rgb = _upright(picture, ratio)
+                    size = size or rgb.shape
+                    if rgb.shape != size:
+                        skipped += 1
+                        continue
+                    yield Frame(number - 1, rgb)
+                    given += 1
+                    if max_frames is not None and given >= max_frames:
+                        return
+        if given == 0:
+            raise InputError(f"{self.path}: no picture in it can be decoded")
+        if skipped or ended_early or number < self.count:
+            self._warn(f"{self.path}: damaged or cut short; {number} frames could be decoded")
+
+    def _warn(self, line: str) -> None:
+        if line not in self.warnings:
+            self.warnings.append(line)
+
+
+def open_video(path: Path | str) -> Video:
+    """Looks at a video file. Raises InputError: no such file, not a video, no video stream."""
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such video file")
+    with _open(path) as container:
+        stream = _video_stream(container, path)
+        return Video(path, float(stream.average_rate or 0), int(stream.frames or 0))
+
+
+def _av() -> Any:
+    try:
+        return importlib.import_module("av")
+    except ImportError as error:
+        raise InputError("PyAV, which reads videos, is missing; `pip install av`") from error
+
+
+def _open(path: Path) -> Any:
+    av = _av()
+    try:
+        return av.open(str(path))
+    except (av.error.FFmpegError, ValueError, OSError) as error:
+        raise InputError(f"{path}: not a readable video ({_reason(error)})") from error
+
+
+def _reason(error: Exception) -> str:
+    return str(getattr(error, "strerror", None) or error).splitlines()[0]
+
+
+def _video_stream(container: Any, path: Path) -> Any:
+    streams = container.streams.video
+    if not streams or streams[0].codec_context is None:
+        raise InputError(f"{path}: has no video stream")
+    # a sound file's cover picture is a video stream to the demuxer
+    if _value(getattr(streams[0], "disposition", 0)) & _COVER_PICTURE:
+        raise InputError(f"{path}: has no video stream, only a cover picture")
+    streams[0].thread_type = "AUTO"
+    return streams[0]
+
+
+def _value(flags: Any) -> int:
+    return int(getattr(flags, "value", flags))
+
+
+def _packets(container: Any, stream: Any) -> Iterator[Any]:
+    """Packets of the stream, then None where the file breaks off."""
+    packets = container.demux(stream)
+    while True:
+        try:
+            yield next(packets)
+        except StopIteration:
+            return
+        except _av().error.FFmpegError:
+            yield None
+            return
+
+
+def _decoded(packet: Any) -> Iterator[Any]:
+    """The packet's pictures, or None once where it is damaged."""
+    try:
+        yield from packet.decode()
+    except _av().error.FFmpegError:
+        yield None
+
+
+def _pixel_aspect(stream: Any) -> float:
+    ratio = float(stream.codec_context.sample_aspect_ratio or 1)
+    return ratio if 0.1 < ratio < 10 else 1.0
+
+
+def _upright(picture: Any, ratio: float) -> np.ndarray:
+    """Square pixels, then turned as the file's display matrix says."""
+    width = max(1, round(picture.width * ratio))
+    rgb = picture.to_ndarray(format="rgb24", width=width, height=picture.height)
+    quarter_turns = round(getattr(picture, "rotation", 0) / 90) % 4
+    return np.ascontiguousarray(np.rot90(rgb, quarter_turns))

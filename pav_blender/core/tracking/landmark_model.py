@@ -1,0 +1,235 @@
+"""The head's landmarks as a small model of their own: positions and exact derivatives.
+
+Posing 478 points instead of some ten thousand vertices is what makes a Gauss-Newton fit of whole
+clips take seconds. A landmark is a fixed mix of three vertices and skinning is linear in vertex
+positions, so mixing commutes with it and the points are those of `HeadModel.pose`, not nearly so.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from ..errors import InputError
+from ..head import HeadModel
+
+# MediaPipe's face mesh, by the numbers its documentation gives
+LIPS = (
+    61, 146, 91, 181, 84, 17, 314, 405, 321, 375, 291, 185, 40, 39, 37, 0, 267, 269, 270, 409,
+    78, 95, 88, 178, 87, 14, 317, 402, 318, 324, 308, 191, 80, 81, 82, 13, 312, 311, 310, 415,
+)  # fmt: skip
+RIGHT_LIDS = (33, 7, 163, 144, 145, 153, 154, 155, 133, 173, 157, 158, 159, 160, 161, 246)
+LEFT_LIDS = (263, 249, 390, 373, 374, 380, 381, 382, 362, 398, 384, 385, 386, 387, 388, 466)
+OVAL = (
+    10, 338, 297, 332, 284, 251, 389, 356, 454, 323, 361, 288, 397, 365, 379, 378, 400, 377,
+    152, 148, 176, 149, 150, 136, 172, 58, 132, 93, 234, 127, 162, 21, 54, 103, 67, 109,
+)  # fmt: skip
+RIGHT_IRIS = (468, 469, 470, 471, 472)
+LEFT_IRIS = (473, 474, 475, 476, 477)
+# upper lid, lower lid, outer corner, inner corner
+RIGHT_OPENING, LEFT_OPENING = (159, 145, 33, 133), (386, 374, 263, 362)
+
+
+@dataclass(eq=False)
+class Posed:
+    """points [F,L,3] metres; what `LandmarkModel.jacobian` needs to go on."""
+
+    points: np.ndarray
+    parts: np.ndarray  # [F,L,J,3]: each joint's share of a point, translation left out
+    turns: np.ndarray  # [F,J,3,3] joints' rotations in the world
+    places: np.ndarray  # [F,J,3] joints' positions, translation left out
+    local: np.ndarray  # [F,J,3,3] joints' own rotations
+
+
+class LandmarkModel:
+    """L landmarks of `head`, with the first `shapes` identity components.
+
+    Raises InputError where the head has no landmarks.
+    """
+
+    def __init__(self, head: HeadModel, shapes: int) -> None:
+        if len(head.landmark_triangles) == 0:
+            raise InputError(
+                f"head {head.name!r} has no landmark embedding, which tracking needs; add one "
+                "(docs: head files) or track with the built-in head"
+            )
+        self.head = head
+        corners = head.triangles[head.landmark_triangles]  # [L,3]
+        mix = head.landmark_barycentrics.astype(np.float64)
+        skin = mix[..., None] * head.skinning_weights[corners]  # [L,3,J]
+        self.shapes = min(shapes, len(head.shape_basis))
+        self.expressions = len(head.expression_basis)
+        self.correctives = len(head.pose_basis)
+        bases = np.concatenate(
+            [
+                head.shape_basis[: self.shapes, corners],
+                head.expression_basis[:, corners],
+                head.pose_basis[:, corners],
+            ]
+        ).astype(np.float64)  # [K,L,3,3]
+        self.share = skin.sum(axis=1)  # [L,J]
+        self.rest = np.einsum("lvj,lvx->ljx", skin, head.template[corners].astype(np.float64))
+        self.basis = np.einsum("lvj,klvx->ljxk", skin, bases, optimize=True)  # [L,J,3,K]
+        regressor = head.joint_regressor.astype(np.float64)
+        self.joint_rest = regressor @ head.template
+        self.joint_basis = np.einsum(
+            "jv,bvx->jxb", regressor, head.shape_basis[: self.shapes], optimize=True
+        )
+        self.parents = head.joint_parents.tolist()
+        self.joints = len(self.parents)
+        self.subtree = _subtrees(self.parents)
+
+    @cached_property
+    def normals(self) -> np.ndarray:
+        """Outward directions [L,3] of the neutral head at the landmarks; lips, lids and irises,
+        whose own surface turns inward, face forward."""
+        head = self.head
+        vertices = head.template.astype(np.float64)
+        a, b, c = (vertices[head.triangles[:, i]] for i in range(3))
+        flat = np.cross(b - a, c - a)
+        summed = np.zeros_like(vertices)
+        for i in range(3):
+            np.add.at(summed, head.triangles[:, i], flat)
+        corners = head.triangles[head.landmark_triangles]
+        normals = (summed[corners] * head.landmark_barycentrics[..., None]).sum(axis=1)
+        normals[[*LIPS, *RIGHT_LIDS, *LEFT_LIDS, *RIGHT_IRIS, *LEFT_IRIS]] = (0, 0, 1)
+        return normals / np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-12)
+
+    def pose(
+        self,
+        betas: np.ndarray,
+        expression: np.ndarray,
+        pose: np.ndarray,
+        translation: np.ndarray,
+    ) -> Posed:
+        """betas [shapes], expression [F,E], pose [F,J,3] axis-angle, translation [F,3]."""
+        frames = len(pose)
+        local = rotations(pose)
+        joints = self.joint_rest + self.joint_basis @ betas
+        turns, places = [local[:, 0]], [np.broadcast_to(joints[0], (frames, 3))]
+        for joint in range(1, self.joints):
+            parent = self.parents[joint]
+            places.append(places[parent] + turns[parent] @ (joints[joint] - joints[parent]))
+            turns.append(turns[parent] @ local[:, joint])
+        turn, place = np.stack(turns, 1), np.stack(places, 1)
+        coefficients = [np.broadcast_to(betas, (frames, self.shapes)), expression]
+        if self.correctives:
+            coefficients.append((local[:, 1:] - np.eye(3)).reshape(frames, -1))
+        own = self.rest + np.tensordot(np.concatenate(coefficients, 1), self.basis, (1, 3))
+        shift = place - (turn @ joints[..., None])[..., 0]
+        parts = np.einsum("fjxy,fljy->fljx", turn, own, optimize=True)
+        parts += self.share[..., None] * shift[:, None]
+        points = parts.sum(axis=2) + translation[:, None]
+        return Posed(points, parts, turn, place, local)
+
+    def jacobian(self, posed: Posed, pose: np.ndarray, outer: np.ndarray) -> _Jacobian:
+        """Derivatives of `outer @ point`, outer [F,L,D,3] (a projection's own derivative).
+
+        Returns shape [F,L,D,shapes], expression [F,L,D,E], pose [F,L,D,J,3] (axis-angle),
+        translation [F,L,D,3].
+        """
+        frames, count, rows = outer.shape[:3]
+        turned = np.einsum("fldx,fjxy->lfdjy", outer, posed.turns, optimize=True)
+        flat = turned.reshape(count, frames * rows, self.joints * 3)
+        linear = flat @ self.basis.reshape(count, self.joints * 3, -1)
+        linear = linear.reshape(count, frames, rows, -1).transpose(1, 0, 2, 3)
+        shape = linear[..., : self.shapes]
+        shape = shape + self._joint_effect(posed, outer)
+        expression = linear[..., self.shapes : self.shapes + self.expressions]
+        swings = rotation_derivatives(pose, posed.local)  # [F,J,3(k),3,3]
+        columns = np.empty((frames, count, rows, self.joints, 3))
+        for joint in range(self.joints):
+            parent = self.parents[joint]
+            before = posed.turns[:, parent] if parent >= 0 else np.eye(3)[None]
+            spin = np.einsum(
+                "fab,fkbc,fdc->fkad", before, swings[:, joint], posed.turns[:, joint], optimize=True
+            )
+            below = self.subtree[joint]
+            lever = posed.parts[:, :, below].sum(axis=2)
+            lever -= self.share[:, below].sum(axis=1)[:, None] * posed.places[:, None, joint]
+            columns[..., joint, :] = np.einsum(
+                "fldx,fkxy,fly->fldk", outer, spin, lever, optimize=True
+            )
+            if self.correctives and joint > 0:
+                first = self.shapes + self.expressions + 9 * (joint - 1)
+                columns[..., joint, :] += np.einsum(
+                    "fldc,fkc->fldk",
+                    linear[..., first : first + 9],
+                    swings[:, joint].reshape(frames, 3, 9),
+                )
+        return _Jacobian(shape, expression, columns, outer)
+
+    def _joint_effect(self, posed: Posed, outer: np.ndarray) -> np.ndarray:
+        """How identity moves landmarks by moving the joints they turn about."""
+        moved = [np.broadcast_to(self.joint_basis[0], (len(outer), *self.joint_basis[0].shape))]
+        for joint in range(1, self.joints):
+            parent = self.parents[joint]
+            bone = self.joint_basis[joint] - self.joint_basis[parent]
+            moved.append(moved[parent] + posed.turns[:, parent] @ bone)
+        shift = np.stack(moved, 1) - posed.turns @ self.joint_basis  # [F,J,3,B]
+        drift = np.einsum("lj,fjxb->flxb", self.share, shift, optimize=True)
+        return outer @ drift
+
+
+@dataclass(eq=False)
+class _Jacobian:
+    shape: np.ndarray
+    expression: np.ndarray
+    pose: np.ndarray
+    translation: np.ndarray
+
+
+def _subtrees(parents: list[int]) -> list[list[int]]:
+    below: list[list[int]] = [[joint] for joint in range(len(parents))]
+    for joint in range(len(parents) - 1, 0, -1):
+        below[parents[joint]] += below[joint]
+    return below
+
+
+def cross_matrices(vectors: np.ndarray) -> np.ndarray:
+    """[...,3] -> [...,3,3] with `m @ x = cross(vector, x)`."""
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    zero = np.zeros_like(x)
+    rows = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1)
+    return rows.reshape(*vectors.shape[:-1], 3, 3)
+
+
+def rotations(vectors: np.ndarray) -> np.ndarray:
+    """Axis-angle [...,3] radians -> matrices [...,3,3]."""
+    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
+    cross = cross_matrices(vectors)
+    sine = np.sinc(angle / np.pi)
+    cosine = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
+    return np.eye(3) + sine * cross + cosine * (cross @ cross)
+
+
+def axis_angles(matrices: np.ndarray) -> np.ndarray:
+    """Rotation matrices [...,3,3] -> axis-angle [...,3]; turns of less than half a circle."""
+    skew = np.stack(
+        [
+            matrices[..., 2, 1] - matrices[..., 1, 2],
+            matrices[..., 0, 2] - matrices[..., 2, 0],
+            matrices[..., 1, 0] - matrices[..., 0, 1],
+        ],
+        -1,
+    )
+    cosine = ((np.trace(matrices, axis1=-2, axis2=-1) - 1) / 2).clip(-1, 1)
+    angle = np.arccos(cosine)
+    return skew / (2 * np.sinc(angle / np.pi))[..., None].clip(1e-9)
+
+
+def rotation_derivatives(vectors: np.ndarray, matrices: np.ndarray) -> np.ndarray:
+    """d matrix / d vector_k, [...,3(k),3,3] (Gallego and Yezzi 2015, with the limit at zero)."""
+    squared = (vectors * vectors).sum(-1)[..., None]
+    small = squared < 1e-10
+    left = np.eye(3) - matrices
+    spun = np.cross(vectors[..., None, :], np.moveaxis(left, -1, -2))  # row k: v x (I - R) e_k
+    axis = (vectors[..., None] * vectors[..., None, :] + spun) / np.where(small, 1, squared)[
+        ..., None
+    ]
+    axis = np.where(
+        small[..., None], np.eye(3) + 0.5 * cross_matrices(vectors).swapaxes(-1, -2), axis
+    )
+    return cross_matrices(axis) @ matrices[..., None, :, :]
