@@ -86,7 +86,7 @@ class Config:
 
     @classmethod
     def preset(cls, name: str) -> Config:
-        """"default" or "paper"."""
+        """ "default" or "paper"."""
         presets = {"default": cls, "paper": cls.paper}
         if name not in presets:
             raise InputError(f"preset {name!r}: one of {', '.join(presets)}")

@@ -139,9 +139,7 @@ def _write(
     _save(path, spec, pixels, metadata)
 
 
-def _save(
-    path: Path | str, spec: Any, pixels: np.ndarray, metadata: dict[str, Any] | None
-) -> None:
+def _save(path: Path | str, spec: Any, pixels: np.ndarray, metadata: dict[str, Any] | None) -> None:
     oiio = _oiio()
     path = Path(path)
     for key, value in (metadata or {}).items():

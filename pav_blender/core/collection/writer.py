@@ -61,9 +61,7 @@ class CollectionWriter:
     def __enter__(self) -> CollectionWriter:
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            partial = tempfile.mkdtemp(
-                prefix=f"{self.path.name}.partial-", dir=self.path.parent
-            )
+            partial = tempfile.mkdtemp(prefix=f"{self.path.name}.partial-", dir=self.path.parent)
         except OSError as error:
             raise InputError(f"{self.path}: cannot write there: {error.strerror}") from error
         self.root = Path(partial)

@@ -7,7 +7,7 @@ import numpy as np
 from ..kernels import cpu as _cpu  # first: it says where numba keeps compiled code
 from .cameras import Camera
 
-from numba import njit  # noqa: E402  # isort: skip
+from numba import njit  # isort: skip
 
 
 def rasterise(

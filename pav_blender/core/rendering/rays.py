@@ -90,5 +90,3 @@ def samples_of(
         expression=expression[None],
         direction=turned,
     )
-
-

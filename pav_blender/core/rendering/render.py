@@ -36,7 +36,7 @@ class RenderSettings:
 
     @classmethod
     def preset(cls, name: str) -> RenderSettings:
-        """"preview" (fast), "final", "reference" (every sample, to the end of the ray)."""
+        """ "preview" (fast), "final", "reference" (every sample, to the end of the ray)."""
         presets = {
             "preview": cls(step=2.5e-3, transmittance=1e-2),
             "final": cls(),
@@ -234,5 +234,3 @@ def _trace(scene: Scene, rays: RayBatch, settings: RenderSettings) -> tuple[np.n
     rgba = torch.where(seen[:, None], torch.cat([straight, alpha[:, None]], 1), 0.0)
     along = torch.where(seen, depth / safe[:, 0] * rays.cosine, torch.inf)
     return rgba.numpy(), along.numpy()
-
-

@@ -79,7 +79,11 @@ def draw_pixels(frames: list[Frame], rays: int, random: np.random.Generator) -> 
         starts.append(total)
         total += len(columns)
         parts.append(
-            (camera_rays(frame.camera, columns, rows), frame.rgba[rows, columns], frame.depth[rows, columns])
+            (
+                camera_rays(frame.camera, columns, rows),
+                frame.rgba[rows, columns],
+                frame.depth[rows, columns],
+            )
         )
     rgba = torch.from_numpy(np.concatenate([p[1] for p in parts]).astype(np.float32) / 255)
     counts = [len(p[0]) for p in parts]

@@ -106,7 +106,9 @@ def _carry(
     mesh: PosedMesh = back.pose(canonical)
     moved = canonicalise(points, triangle, barycentric, mesh).numpy()
     # a nearly flat triangle may throw points far off: those say nothing
-    foot = (vertices[rest.triangles.numpy()[triangle.numpy()]] * barycentric.numpy()[:, :, None]).sum(1)
+    foot = (
+        vertices[rest.triangles.numpy()[triangle.numpy()]] * barycentric.numpy()[:, :, None]
+    ).sum(1)
     rest_foot = (
         canonical[rest.triangles.numpy()[triangle.numpy()]] * barycentric.numpy()[:, :, None]
     ).sum(1)

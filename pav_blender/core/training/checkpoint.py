@@ -69,9 +69,7 @@ def load_checkpoint(path: Path, trainer: Trainer, source: str) -> None:
         for name, (m, v) in trainer.moments.items():
             m.copy_(tensors[f"m.{name}"])
             v.copy_(tensors[f"v.{name}"])
-        trainer.visibility.restore(
-            tensors["occupied"].numpy(), tensors["weight"], tensors["looks"]
-        )
+        trainer.visibility.restore(tensors["occupied"].numpy(), tensors["weight"], tensors["looks"])
         trainer.generator.set_state(tensors["generator"])
         trainer.random.bit_generator.state = header["random"]
         trainer.status = Status(**header["status"])

@@ -48,9 +48,7 @@ def train(
         raise InputError(f"{saved}: no checkpoint to resume from")
     frames = load_training_frames(collection, loading)
     source = fingerprint(collection)
-    trainer = Trainer(
-        new_avatar(collection, frames, config or Config()), frames, minutes=minutes
-    )
+    trainer = Trainer(new_avatar(collection, frames, config or Config()), frames, minutes=minutes)
     if resume:
         load_checkpoint(saved, trainer, source)
     last_saved = time.monotonic()

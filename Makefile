@@ -1,0 +1,35 @@
+# make demo: the main job on the built-in default. make test: everything that is checked.
+# Both make .venv first. Another interpreter: make PYTHON=python3.13 test
+PYTHON ?= python3.11
+VENV ?= .venv
+RUN = $(VENV)/bin/python
+OUT ?= out
+
+.PHONY: demo test test-all lint extension test-real-blender clean
+
+demo: $(VENV)/ready
+	$(RUN) -m pav_blender demo --out $(OUT)/demo --check
+
+test: $(VENV)/ready lint extension
+	$(RUN) -m pytest tests --durations=10
+
+test-all: $(VENV)/ready lint extension
+	PAV_SLOW=1 $(RUN) -m pytest tests --durations=20
+
+lint: $(VENV)/ready
+	$(VENV)/bin/ruff check pav_blender tests tools
+	$(VENV)/bin/mypy
+
+extension: $(VENV)/ready
+	$(RUN) tools/build_extension.py --out $(OUT)
+
+# BLENDER: an executable or a wrapper, e.g. BLENDER=/opt/blender/blender
+test-real-blender: $(VENV)/ready extension
+	BLENDER="$(BLENDER)" $(RUN) -m pytest tests/real_blender
+
+$(VENV)/ready: requirements/py311.txt requirements/py313.txt pyproject.toml
+	tools/make_venv.sh $(PYTHON) $(VENV)
+	touch $@
+
+clean:
+	rm -rf $(VENV) $(OUT)

@@ -1,0 +1,99 @@
+"""Looking a collection over: what it holds, what is wrong, and the mesh laid over its pictures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from ..collection import Clip, Collection
+from ..errors import InputError
+from ..images import write_rgba
+from ..progress import Report
+from ..rendering.rasterise import rasterise
+from ..training.frames import camera_of, load_picture
+from .sheet import grid
+
+_OVERLAYS = 6  # frames a clip
+
+
+@dataclass
+class Findings:
+    """summary: a dict for each clip; problems: one line each, naming the file."""
+
+    summary: list[dict] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
+
+
+def check(collection: Collection, *, progress: Report | None = None) -> Findings:
+    """Opens every picture. Arrays were checked when the collection was read."""
+    findings = Findings()
+    total = sum(len(clip) for clip in collection.clips)
+    done = 0
+    for clip in collection.clips:
+        opaque, overlap = [], []
+        for row in range(len(clip)):
+            done += 1
+            try:
+                rgba = load_picture(collection, clip, row)
+            except InputError as error:
+                findings.problems.append(str(error))
+                continue
+            opaque.append(float((rgba[..., 3] > 127).mean()))
+            if opaque[-1] == 0:
+                findings.problems.append(f"{collection.image_path(clip, row)}: the matte is empty")
+            overlap.append(_mesh_in_matte(collection, clip, row, rgba))
+            if progress:
+                progress(done / total, clip=clip.name)
+        covered = float(np.mean(overlap)) if overlap else 0.0
+        if covered < 0.8:
+            findings.problems.append(
+                f"{collection.path}: clip {clip.name}: only {covered:.0%} of the tracked face lies "
+                "inside the matte; the track and the pictures do not belong together"
+            )
+        findings.summary.append(
+            {
+                "clip": clip.name,
+                "appearance": clip.appearance,
+                "frames": len(clip),
+                **{split: len(clip.indices(split)) for split in ("train", "test", "view")},
+                "size": f"{clip.width}x{clip.height}",
+                "matte": round(float(np.mean(opaque)) if opaque else 0.0, 3),
+                "face_in_matte": round(covered, 3),
+            }
+        )
+    return findings
+
+
+def _mesh_in_matte(collection: Collection, clip: Clip, row: int, rgba: np.ndarray) -> float:
+    """Part of the face's vertices in the picture that project into the matte."""
+    vertices = collection.posed(clip, np.array([row]))[0]
+    face = vertices[collection.head.regions["face"]]
+    pixels, depth = camera_of(clip, row).project(face)
+    at = np.floor(pixels).astype(int)
+    inside = (depth > 0) & (at >= 0).all(1) & (at[:, 0] < clip.width) & (at[:, 1] < clip.height)
+    if not inside.any():
+        return 0.0
+    return float((rgba[at[inside, 1], at[inside, 0], 3] > 64).mean())
+
+
+def overlay(collection: Collection, clip: Clip, row: int) -> np.ndarray:
+    """The picture with the mesh's triangle edges on it, float32 [H, W, 4] in [0, 1]."""
+    rgba = load_picture(collection, clip, row).astype(np.float32) / 255
+    shown = rgba[..., :3] * rgba[..., 3:] + 0.25 * (1 - rgba[..., 3:])
+    vertices = collection.posed(clip, np.array([row]))[0]
+    camera = camera_of(clip, row)
+    _, triangle, barycentric = rasterise(vertices, collection.head.triangles, camera)
+    edge = (triangle >= 0) & (barycentric.min(-1) < 0.06)
+    shown[edge] = 0.45 * shown[edge] + 0.55 * np.array([0.2, 0.9, 0.5])
+    return np.concatenate([shown, np.ones_like(shown[..., :1])], 2).astype(np.float32)
+
+
+def write_overlays(collection: Collection, path: Path) -> None:
+    """A sheet: a row a clip, up to six frames spread over it."""
+    rows = []
+    for clip in collection.clips:
+        at = np.linspace(0, len(clip) - 1, min(_OVERLAYS, len(clip))).round().astype(int)
+        rows.append([overlay(collection, clip, int(row)) for row in at])
+    write_rgba(path, grid(rows))

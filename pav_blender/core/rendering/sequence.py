@@ -1,0 +1,141 @@
+"""An avatar along a track, written as an image sequence."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from ..collection import Clip, Collection, read_collection
+from ..errors import InputError
+from ..field.avatar import Avatar
+from ..images import write_exr, write_rgba
+from ..progress import Report
+from .cameras import Camera
+from .colour import linear_premultiplied
+from .render import Picture, RenderSettings, render
+
+
+def parse_track(track: str) -> tuple[Collection, Clip]:
+    """ "FOLDER:CLIP" -> the collection and its clip; InputError where there is none."""
+    folder, separator, name = track.rpartition(":")
+    if not separator or not folder:
+        raise InputError(f"track {track!r}: write COLLECTION:CLIP, e.g. out/collection:short")
+    collection = read_collection(folder)
+    return collection, collection.clip(name)
+
+
+def parse_frames(text: str | None, clip: Clip) -> np.ndarray:
+    """ "A-B" or "A" -> rows of the clip whose frame numbers lie in it; None: all."""
+    if text is None:
+        return np.arange(len(clip))
+    match = re.fullmatch(r"(\d+)(?:-(\d+))?", text)
+    if not match:
+        raise InputError(f"frames {text!r}: write A-B or a single number")
+    low, high = int(match[1]), int(match[2] or match[1])
+    rows = np.flatnonzero((clip.frame_id >= low) & (clip.frame_id <= high))
+    if len(rows) == 0:
+        raise InputError(
+            f"frames {text!r}: clip {clip.name!r} has {clip.frame_id.min()} to "
+            f"{clip.frame_id.max()}"
+        )
+    return rows
+
+
+def numbered(pattern: str, number: int) -> Path:
+    """The path of a frame: each run of # becomes the number, padded to the run's length."""
+    return Path(re.sub(r"#+", lambda run: f"{number:0{len(run[0])}d}", pattern))
+
+
+def check_head(avatar: Avatar, collection: Collection) -> None:
+    """InputError where the track moves another head than the avatar's."""
+    if avatar.head_fingerprint != collection.head.fingerprint:
+        raise InputError(
+            f"{collection.path}: tracked with head {collection.head_name!r}; the avatar was "
+            f"trained on {avatar.head_name!r}, another mesh"
+        )
+
+
+def render_track(
+    avatar_path: Path | str,
+    track: str,
+    appearance: str,
+    out: str,
+    *,
+    size: int | None = None,
+    frames: str | None = None,
+    depth: bool = False,
+    quality: str = "final",
+    progress: Report | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> list[Path]:
+    """Renders and writes one picture a frame; returns their paths.
+
+    appearance: a name, or "all" with {appearance} in `out`. The collection's own identity poses
+    the mesh. Raises InputError before anything is written.
+    """
+    avatar = Avatar.load(avatar_path)
+    collection, clip = parse_track(track)
+    check_head(avatar, collection)
+    names = avatar.appearances if appearance == "all" else [appearance]
+    for name in names:
+        avatar.appearance_index(name)
+    rows = parse_frames(frames, clip)
+    settings = RenderSettings.preset(quality)
+    check_pattern(out, several=len(rows) > 1, appearances=len(names), depth=depth)
+    if size is not None and not 1 <= size <= 16384:
+        raise InputError(f"--size {size}: from 1 to 16384")
+    # the avatar's own identity, so that another person's track drives without reshaping it
+    head = collection.head
+    posed = head.pose(avatar.betas, clip.expression[rows], clip.pose[rows], clip.translation[rows])
+    written = []
+    total = len(rows) * len(names)
+    for name in names:
+        for at, row in enumerate(rows):
+            camera = Camera(
+                clip.width, clip.height, clip.intrinsics[row], clip.camera_to_world[row]
+            )
+            if size is not None:
+                scale = size / max(clip.width, clip.height)
+                camera = camera.resized(
+                    max(1, round(clip.width * scale)), max(1, round(clip.height * scale))
+                )
+            picture = render(
+                avatar,
+                posed[at].numpy(),
+                camera,
+                name,
+                settings,
+                expression=clip.expression[row],
+                should_stop=should_stop,
+            )
+            path = numbered(out.replace("{appearance}", name), int(clip.frame_id[row]))
+            write_picture(path, picture, {"pav:appearance": name, "pav:avatar": str(avatar_path)})
+            written.append(path)
+            if progress:
+                progress(len(written) / total, picture=str(path))
+    return written
+
+
+def write_picture(path: Path, picture: Picture, metadata: dict[str, str]) -> None:
+    """PNG: 8 bit, straight sRGB. EXR: scene-linear, premultiplied, with depth in metres."""
+    if path.suffix == ".exr":
+        depth = np.where(np.isfinite(picture.depth), picture.depth, 1e10)
+        write_exr(path, linear_premultiplied(picture.rgba), depth, metadata)
+    else:
+        write_rgba(path, picture.rgba, metadata=metadata)
+
+
+def check_pattern(out: str, *, several: bool, appearances: int, depth: bool = False) -> None:
+    """InputError where the pictures of a sequence could not all have a path of their own."""
+    suffix = Path(out).suffix
+    if suffix not in (".png", ".exr"):
+        raise InputError(f"--out {out!r}: pictures end in .png or .exr")
+    if depth and suffix != ".exr":
+        raise InputError(f"--out {out!r}: depth needs .exr")
+    if several and "#" not in out:
+        raise InputError(f"--out {out!r}: several frames need # for the number, e.g. ####.png")
+    if appearances > 1 and "{appearance}" not in out:
+        raise InputError(f"--out {out!r}: several appearances need {{appearance}} in it")

@@ -1,0 +1,66 @@
+"""`pav train`."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import signal
+from pathlib import Path
+from types import FrameType
+
+from ..core.progress import Progress
+
+SUMMARY = "Train an avatar on the training frames of a collection."
+EXAMPLE = "pav train out/collection --out out/avatar.pav --minutes 5"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("collection", type=Path, help="folder of the collection")
+    parser.add_argument("--out", type=Path, required=True, help="avatar file to write (.pav)")
+    parser.add_argument("--minutes", type=float, help="plan for this long")
+    parser.add_argument("--iterations", type=int, help="or for so many iterations (15000)")
+    parser.add_argument("--preset", default="default", help="default, or paper: its own settings")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--resume", action="store_true", help="go on from the last checkpoint")
+
+
+class StopSignal:
+    """True after Ctrl-C or a polite kill, so that work ends where it can be taken up again."""
+
+    def __init__(self) -> None:
+        self._stopped = False
+        for kind in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(kind, self._stop)
+
+    def _stop(self, number: int, frame: FrameType | None) -> None:
+        self._stopped = True
+
+    def __call__(self) -> bool:
+        return self._stopped
+
+
+def run(args: argparse.Namespace) -> int:
+    from ..core.config import Config
+    from ..core.training.train import train
+
+    changes = {"seed": args.seed}
+    if args.iterations is not None:
+        changes["iterations"] = args.iterations
+    config = dataclasses.replace(Config.preset(args.preset), **changes)
+    avatar = train(
+        args.collection,
+        args.out,
+        config,
+        minutes=args.minutes,
+        resume=args.resume,
+        progress=Progress("train", as_json=args.json_progress),
+        loading=Progress("read", as_json=args.json_progress),
+        should_stop=StopSignal(),
+    )
+    record = avatar.record
+    print(
+        f"{args.out}: {len(avatar.appearances)} appearances ({', '.join(avatar.appearances)}), "
+        f"{record['iterations']} iterations in {record['seconds']:.0f} s, "
+        f"{record['batch_psnr']:.1f} dB on training rays"
+    )
+    return 0

@@ -1,0 +1,69 @@
+"""Shared fixtures: a toy collection and a toy avatar, each made once."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+SLOW = bool(os.environ.get("PAV_SLOW"))
+
+
+def pytest_collection_modifyitems(items):
+    skip = pytest.mark.skip(reason="slow: runs in `make test-all`")
+    for item in items:
+        if "slow" in item.keywords and not SLOW:
+            item.add_marker(skip)
+
+
+@pytest.fixture(scope="session")
+def toy_path(tmp_path_factory) -> Path:
+    from toy import make_toy
+
+    return make_toy(tmp_path_factory.mktemp("toy") / "collection")
+
+
+@pytest.fixture(scope="session")
+def toy(toy_path):
+    from pav_blender.core.collection import read_collection
+
+    return read_collection(toy_path)
+
+
+@pytest.fixture(scope="session")
+def small_config():
+    from pav_blender.core.config import Config
+
+    return dataclasses.replace(
+        Config(),
+        log2_entries=14,
+        levels=8,
+        finest_resolution=256,
+        occupancy_resolution=64,
+        rays=1024,
+        frames_per_batch=4,
+        iterations=250,
+        step=2e-3,
+    )
+
+
+@pytest.fixture(scope="session")
+def toy_avatar_path(toy, small_config, tmp_path_factory) -> Path:
+    """An avatar trained for some seconds on the toy collection."""
+    from pav_blender.core.training.train import train
+
+    path = tmp_path_factory.mktemp("avatar") / "toy.pav"
+    train(toy, path, small_config)
+    return path
+
+
+@pytest.fixture(scope="session")
+def toy_avatar(toy_avatar_path):
+    from pav_blender.core.field.avatar import Avatar
+
+    return Avatar.load(toy_avatar_path)

@@ -1,0 +1,130 @@
+import json
+import shutil
+
+import numpy as np
+import pytest
+from toy import APPEARANCES
+
+from pav_blender.core.collection import CollectionWriter, read_collection
+from pav_blender.core.errors import InputError
+from pav_blender.core.evaluation.check import check, write_overlays
+from pav_blender.core.images import read_rgba
+
+
+@pytest.fixture
+def copy(toy_path, tmp_path):
+    return shutil.copytree(toy_path, tmp_path / "copy")
+
+
+def rewrite(path, **changes):
+    """frames.npz of a clip with some arrays replaced, or left out where None."""
+    with np.load(path, allow_pickle=False) as stored:
+        arrays = {k: stored[k] for k in stored.files} | changes
+    np.savez(path, **{k: v for k, v in arrays.items() if v is not None})
+
+
+def test_what_was_written_is_read(toy):
+    assert toy.appearances == list(APPEARANCES)
+    clip = toy.clip("bushy")
+    assert len(clip) == 8
+    assert list(clip.indices("test")) == [6, 7]
+    assert toy.posed(clip, np.array([0])).shape == (1, len(toy.head.template), 3)
+
+
+def test_hidden_colours_are_written_as_zero(toy):
+    rgba = read_rgba(toy.image_path(toy.clips[0], 0))
+    assert not rgba[rgba[..., 3] == 0].any()
+    assert (rgba[..., 3] == 255).any()
+
+
+def test_an_interrupted_writer_leaves_nothing(tmp_path):
+    with pytest.raises(RuntimeError), CollectionWriter(tmp_path / "c", "builtin", np.zeros(2)) as w:
+        w.image("a", 0, np.zeros((4, 4, 4), np.uint8))
+        raise RuntimeError("the studio broke")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_is_no_collection_is_never_replaced(tmp_path):
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "me.png").write_bytes(b"x")
+    with pytest.raises(InputError, match="not a collection"):
+        CollectionWriter(tmp_path / "photos", "builtin", np.zeros(2), overwrite=True)
+    assert (tmp_path / "photos" / "me.png").exists()
+
+
+@pytest.mark.parametrize("name", ["../up", "", "a/b", ".hidden", "x" * 65, "a\n"])
+def test_names_that_leave_the_folder_are_refused(tmp_path, name):
+    with CollectionWriter(tmp_path / "c", "builtin", np.zeros(2)) as writer:
+        with pytest.raises(InputError, match="clip name"):
+            writer.image(name, 0, np.zeros((4, 4, 4), np.uint8))
+        writer.root.mkdir(exist_ok=True)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"pose": None}, "'pose' is missing"),
+        ({"expression": np.zeros((8, 3), np.float32)}, "'expression' has shape"),
+        ({"translation": np.full((8, 3), np.nan, np.float32)}, "'translation' is not finite"),
+        ({"split": np.array(["train"] * 7 + ["holiday"])}, "unknown split"),
+        ({"frame_id": np.zeros(8, np.int32)}, "different numbers"),
+        ({"pose": np.array([object()] * 8, dtype=object)}, "damaged"),
+    ],
+)
+def test_bad_arrays_are_named(copy, changes, words):
+    path = copy / "clips" / "plain" / "frames.npz"
+    rewrite(path, **changes)
+    with pytest.raises(InputError, match=words) as caught:
+        read_collection(copy)
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("length", [0, 1, 100, 2000])
+def test_truncated_arrays_are_told(copy, length):
+    path = copy / "clips" / "plain" / "frames.npz"
+    path.write_bytes(path.read_bytes()[:length])
+    with pytest.raises(InputError, match=r"frames\.npz"):
+        read_collection(copy)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda m: m.update(format="x"), "not a collection file"),
+        (lambda m: m.update(version=99), "version 99"),
+        (lambda m: m["clips"].clear(), "no clips"),
+        (lambda m: m["clips"][0].update(name="../../etc"), "clip name"),
+        (lambda m: m["clips"].append(m["clips"][0]), "same name"),
+        (lambda m: m["head"].pop("betas"), "missing or malformed"),
+        (lambda m: m["clips"][0].update(width=10**9), "picture size"),
+    ],
+)
+def test_bad_descriptions_are_told(copy, change, words):
+    path = copy / "collection.json"
+    meta = json.loads(path.read_text())
+    change(meta)
+    path.write_text(json.dumps(meta))
+    with pytest.raises(InputError, match=words):
+        read_collection(copy)
+
+
+def test_check_finds_a_broken_picture_and_a_wrong_track(copy, toy, tmp_path):
+    assert check(toy).problems == []
+    broken = copy / "clips" / "plain" / "images" / "000003.png"
+    broken.write_bytes(broken.read_bytes()[:60])
+    rewrite(
+        copy / "clips" / "bushy" / "frames.npz",
+        translation=np.full((8, 3), 0.2, np.float32),
+    )
+    problems = check(read_collection(copy)).problems
+    assert any("000003.png" in p for p in problems)
+    assert any("bushy" in p and "do not belong together" in p for p in problems)
+
+
+def test_the_overlay_shows_every_clip(toy, tmp_path):
+    write_overlays(toy, tmp_path / "o.png")
+    sheet = read_rgba(tmp_path / "o.png")
+    assert sheet.shape[0] > 2 * 64
+    assert sheet.shape[1] > 6 * 64
+    green = (sheet[..., 1].astype(int) - sheet[..., 0] > 40).mean()
+    assert green > 0.02

@@ -1,0 +1,64 @@
+import numpy as np
+import pytest
+
+from pav_blender.core.errors import InputError
+from pav_blender.core.images import read_gray, read_rgba, write_exr, write_gray, write_rgba
+
+
+@pytest.fixture
+def pixels():
+    return np.random.default_rng(0).integers(0, 256, (17, 23, 4), np.uint8)
+
+
+def test_bytes_come_back_whatever_the_alpha(tmp_path, pixels):
+    write_rgba(tmp_path / "a.png", pixels)
+    np.testing.assert_array_equal(read_rgba(tmp_path / "a.png"), pixels)
+
+
+def test_floats_and_16_bits_round_to_the_same_bytes(tmp_path, pixels):
+    write_rgba(tmp_path / "a.png", pixels.astype(np.float32) / 255)
+    write_rgba(tmp_path / "b.png", pixels, bits=16)
+    np.testing.assert_array_equal(read_rgba(tmp_path / "a.png"), pixels)
+    np.testing.assert_array_equal(read_rgba(tmp_path / "b.png"), pixels)
+
+
+def test_grey_keeps_its_depth(tmp_path):
+    grey = np.arange(600, dtype=np.uint16).reshape(20, 30) * 100
+    write_gray(tmp_path / "g.png", grey)
+    np.testing.assert_array_equal(read_gray(tmp_path / "g.png"), grey)
+
+
+def test_exr_holds_colour_alpha_and_depth(tmp_path):
+    import OpenImageIO as oiio
+
+    rgba = np.random.default_rng(0).random((5, 6, 4), np.float32)
+    depth = np.linspace(0.3, 1e10, 30, dtype=np.float32).reshape(5, 6)
+    write_exr(tmp_path / "a.exr", rgba, depth, {"pav:appearance": "grey"})
+    source = oiio.ImageInput.open(str(tmp_path / "a.exr"))
+    spec = source.spec()
+    stored = source.read_image("float")
+    order = [spec.channelnames.index(c) for c in ("R", "G", "B", "A", "Z")]
+    np.testing.assert_allclose(stored[..., order[:4]], rgba, atol=1e-3)
+    np.testing.assert_array_equal(stored[..., order[4]], depth)
+    assert spec.getattribute("pav:appearance") == "grey"
+
+
+def test_bad_files_are_told_in_one_line(tmp_path, pixels):
+    write_rgba(tmp_path / "a.png", pixels)
+    whole = (tmp_path / "a.png").read_bytes()
+    (tmp_path / "half.png").write_bytes(whole[: len(whole) // 2])
+    (tmp_path / "text.png").write_text("hello")
+    for name in ("half.png", "text.png", "none.png"):
+        with pytest.raises(InputError) as caught:
+            read_rgba(tmp_path / name)
+        assert name in str(caught.value)
+        assert "\n" not in str(caught.value)
+
+
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, pixels):
+    write_rgba(tmp_path / "a.png", pixels)
+    before = (tmp_path / "a.png").read_bytes()
+    with pytest.raises(Exception, match=""):
+        write_rgba(tmp_path / "a.png", np.zeros((3, 3, 4), np.complex64))
+    assert (tmp_path / "a.png").read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["a.png"]
