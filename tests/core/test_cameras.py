@@ -15,7 +15,8 @@ def camera(seed=0, width=64, height=48):
     pose[:3, :3] = q * np.sign(np.linalg.det(q))
     pose[:3, 3] = random.normal(size=3)
     focal = random.uniform(40, 200)
-    intrinsics = np.array([[focal, 0.5, width / 2 + 3], [0, focal * 1.1, height / 2 - 2], [0, 0, 1]])
+    cx, cy = width / 2 + 3, height / 2 - 2
+    intrinsics = np.array([[focal, 0.5, cx], [0, focal * 1.1, cy], [0, 0, 1]])
     return Camera(width, height, intrinsics, pose)
 
 
@@ -32,7 +33,7 @@ def test_a_ray_through_a_pixel_projects_back_into_it(seed, distance):
 
 
 def test_windows_and_sizes_see_the_same_points():
-    view, points = camera(1), np.random.default_rng(1).normal(size=(20, 3))
+    view, points = camera(1), np.random.default_rng(2).normal(size=(20, 3))
     pixels, _ = view.project(points)
     np.testing.assert_allclose(view.window(5, 7, 30, 40).project(points)[0], pixels - [5, 7])
     np.testing.assert_allclose(view.resized(128, 96).project(points)[0], pixels * 2)

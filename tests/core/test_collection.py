@@ -79,10 +79,11 @@ def test_bad_arrays_are_named(copy, changes, words):
     assert str(path) in str(caught.value)
 
 
-@pytest.mark.parametrize("length", [0, 1, 100, 2000])
-def test_truncated_arrays_are_told(copy, length):
+@pytest.mark.parametrize("part", [0.0, 0.001, 0.1, 0.9])
+def test_truncated_arrays_are_told(copy, part):
     path = copy / "clips" / "plain" / "frames.npz"
-    path.write_bytes(path.read_bytes()[:length])
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(part * len(whole))])
     with pytest.raises(InputError, match=r"frames\.npz"):
         read_collection(copy)
 

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from pav_blender.core.errors import InputError
+from pav_blender.core.files import replacing
 from pav_blender.core.images import read_gray, read_rgba, write_exr, write_gray, write_rgba
 
 
@@ -58,7 +59,8 @@ def test_bad_files_are_told_in_one_line(tmp_path, pixels):
 def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, pixels):
     write_rgba(tmp_path / "a.png", pixels)
     before = (tmp_path / "a.png").read_bytes()
-    with pytest.raises(Exception, match=""):
-        write_rgba(tmp_path / "a.png", np.zeros((3, 3, 4), np.complex64))
+    with pytest.raises(RuntimeError), replacing(tmp_path / "a.png") as temporary:
+        temporary.write_bytes(b"half a file")
+        raise RuntimeError("the disk is full")
     assert (tmp_path / "a.png").read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["a.png"]

@@ -5,8 +5,8 @@ from __future__ import annotations
 from functools import lru_cache
 from pathlib import Path
 
-from pav_blender.core.head.files import read_head
-from pav_blender.core.head.model import HeadModel
+from .files import read_head
+from .model import HeadModel
 
 BUILTIN = "builtin"
 BUILTIN_PATH = Path(__file__).parent / "data" / "builtin_head.npz"

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from pav_blender.core.errors import InputError
-from pav_blender.core.head.model import HeadModel
+from ..errors import InputError
+from .model import HeadModel
 
 FORMAT = "pav-head"
 VERSION = 1

@@ -20,8 +20,8 @@ from functools import cached_property
 import numpy as np
 import torch
 
-from pav_blender.core.errors import InputError
-from pav_blender.core.head.skinning import pose_vertices
+from ..errors import InputError
+from .skinning import pose_vertices
 
 CANONICAL_JAW_DEGREES = 12.0  # INSTA's canonical space: lips apart, so that they do not share points
 _BASES = ("shape_basis", "expression_basis", "pose_basis")

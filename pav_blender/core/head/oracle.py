@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pav_blender.core.head.model import HeadModel
+from .model import HeadModel
 
 
 def rotation_matrix(rotation: np.ndarray) -> np.ndarray:

@@ -9,9 +9,9 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from pav_blender.core.errors import InputError
-from pav_blender.core.kernels.cpu.threads import run_chunks, threads
-from pav_blender.core.kernels.reference.encoding import (
+from ...errors import InputError
+from .threads import run_chunks, threads
+from ..reference.encoding import (
     FEATURES,
     Layout,
     check_encode,

@@ -8,9 +8,9 @@ import numpy as np
 from numba import njit
 from torch import Tensor
 
-from pav_blender.core.errors import InputError
-from pav_blender.core.kernels.cpu.threads import run_chunks
-from pav_blender.core.kernels.reference.optimiser import check_adam, touched_rows
+from ...errors import InputError
+from .threads import run_chunks
+from ..reference.optimiser import check_adam, touched_rows
 
 CHUNK = 1 << 16
 

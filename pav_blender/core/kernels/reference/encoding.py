@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from pav_blender.core.errors import InputError
+from ...errors import InputError
 
 PRIMES = (1, 2654435761, 805459861)
 FEATURES = 2

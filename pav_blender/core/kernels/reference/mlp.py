@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from pav_blender.core.errors import InputError
-from pav_blender.core.kernels.reference.encoding import check_indices
+from ...errors import InputError
+from .encoding import check_indices
 
 
 def mlp(

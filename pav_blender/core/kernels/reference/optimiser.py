@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from pav_blender.core.errors import InputError
+from ...errors import InputError
 
 
 @torch.no_grad()
