@@ -11,17 +11,18 @@ import threading
 from collections import deque
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
+from ..child import GRACE_S
 from ..core.errors import PavError
 
 _KEPT_LINES = 200
-_GRACE_S = 5.0
 
 
 @dataclass
 class Process:
     """A running `pav VERB ... --json-progress`. `step()` takes in what it said since the last
-    call; the process ends with Blender, for it stops when its standard input closes."""
+    call. It stops when its standard input closes, so it ends with Blender, however that ends."""
 
     arguments: list[str]
     fraction: float = 0.0
@@ -34,7 +35,7 @@ class Process:
     def __post_init__(self) -> None:
         try:
             self._child = subprocess.Popen(
-                [interpreter(), "-m", "pav_blender", *self.arguments],
+                [interpreter(), "-m", "pav_blender.child", *self.arguments],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.PIPE,
@@ -77,12 +78,11 @@ class Process:
         self.message = "Stopping"
         assert self._child.stdin is not None
         self._child.stdin.close()
-        self._child.terminate()
         threading.Thread(target=self._kill_late, daemon=True).start()
 
     def _kill_late(self) -> None:
         try:
-            self._child.wait(_GRACE_S)
+            self._child.wait(2 * GRACE_S)
         except subprocess.TimeoutExpired:
             self._child.kill()
 
@@ -102,13 +102,22 @@ class Process:
             self.lines.append(line)
             return
         self.fraction = float(said.get("fraction", self.fraction))
-        self.message = str(said.get("message", self.message))
-        if said.get("error"):
-            self.error = str(said["error"])
+        if not self._stopping:
+            self.message = _describe(said)
 
     def _last_words(self) -> str:
         last = self.lines[-1] if self.lines else "it said nothing"
         return f"pav {self.arguments[0]} ended with code {self._child.returncode}: {last}"
+
+
+def _describe(said: dict[str, Any]) -> str:
+    """One progress line of `core.progress` for a panel: "train 40 %, 1:10 left"."""
+    text = f"{said.get('task', '')} {100 * float(said.get('fraction', 0)):.0f} %".strip()
+    left = said.get("seconds_left")
+    if isinstance(left, int | float):
+        minutes, seconds = divmod(round(left), 60)
+        text += f", {minutes}:{seconds:02d} left"
+    return text
 
 
 def interpreter() -> str:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import InputError
+from ..core.rendering.colour import linear_premultiplied
 from . import avatars
 from .shot import Actor, Shot
 
@@ -37,7 +38,7 @@ def draw(
     for index, actor in enumerate(shot.actors):
         layers.append(_draw_actor(shot, actor, _part(progress, index, count), should_stop))
     display, depth = _stack(layers)
-    combined = to_linear(display)
+    combined = linear_premultiplied(display)
     if shot.background is not None:
         combined[..., :3] += (1 - combined[..., 3:]) * np.asarray(shot.background, np.float32)
         combined[..., 3] = 1.0
@@ -120,13 +121,3 @@ def _stack(layers: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.
     alpha = colour[..., 3:]
     colour[..., :3] /= np.where(alpha > 0, alpha, 1)
     return colour, np.min([depth for _, depth in layers], axis=0)
-
-
-def to_linear(display: np.ndarray) -> np.ndarray:
-    """Straight sRGB [H, W, 4] -> scene-linear premultiplied, what Blender's Combined holds."""
-    linear = np.empty_like(display, dtype=np.float32)
-    colour = np.clip(display[..., :3], 0, 1)
-    linear[..., :3] = np.where(colour <= 0.04045, colour / 12.92, ((colour + 0.055) / 1.055) ** 2.4)
-    linear[..., 3] = np.clip(display[..., 3], 0, 1)
-    linear[..., :3] *= linear[..., 3:]
-    return linear

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -39,7 +38,7 @@ def build_head(avatar_path: Path, appearance: str | None = None) -> Any:
 
     avatar = avatars.load(avatar_path)
     head = load_head(avatar.head_name)
-    if avatar.head_fingerprint and head.fingerprint != avatar.head_fingerprint:
+    if head.fingerprint != avatar.head_fingerprint:
         raise InputError(
             f"{avatar_path}: made with another version of the head {avatar.head_name!r}; "
             "train it again with this one"
@@ -143,14 +142,10 @@ def build_scene(
     camera, size and frames, ready to render. InputError where they do not fit together."""
     import bpy
 
+    from ..core.rendering.sequence import check_head
     from . import avatars
 
-    avatar = avatars.load(avatar_path)
-    if avatar.head_fingerprint and collection.head.fingerprint != avatar.head_fingerprint:
-        raise InputError(
-            f"{collection.path} moves the head {collection.head_name!r}, {avatar_path} has "
-            f"{avatar.head_name!r}: use clips of the same head"
-        )
+    check_head(avatars.load(avatar_path), collection)
     collection.clip(clip_name)  # a wrong name is told before anything is built
     rig = build_head(avatar_path, appearance)
     camera = import_track(rig.mesh, collection, clip_name, fps)
@@ -195,17 +190,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--fps", type=float, default=25.0, help="frames a second (default 25)")
 
 
-def parse_track(text: str) -> tuple[Path, str]:
-    """`COLLECTION:CLIP` -> both; the last colon divides."""
-    folder, colon, clip = text.rpartition(":")
-    if not (folder and colon and clip):
-        raise InputError(f"--track {text!r}: expected COLLECTION:CLIP")
-    return Path(folder), clip
-
-
 def run(args: argparse.Namespace) -> int:
     """`pav scene`: builds the scene in an empty file and saves it, whole or not at all."""
-    from ..core.collection import read_collection
+    from ..core.rendering.sequence import parse_track
 
     if args.out.suffix != ".blend":
         raise InputError(f"--out {args.out}: a Blender file ends in .blend")
@@ -213,13 +200,14 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--out {args.out}: no such folder")
     if not args.fps > 0:
         raise InputError(f"--fps {args.fps}: above 0")
-    folder, clip = parse_track(args.track)
-    collection = read_collection(folder)
+    collection, clip = parse_track(args.track)
     with _blender():
-        made = build_scene(args.avatar, collection, clip, appearance=args.appearance, fps=args.fps)
+        made = build_scene(
+            args.avatar, collection, clip.name, appearance=args.appearance, fps=args.fps
+        )
         made.mesh.pav.avatar = stored_path(args.avatar, str(args.out))
         save_copy(args.out)
-    print(f"{args.out}: {clip}, {len(collection.clip(clip))} frames", file=sys.stderr, flush=True)
+    print(f"{args.out}: clip {clip.name}, {len(clip)} frames")
     return 0
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import Cancelled, InputError, PavError
+from ..core.rendering.colour import linear_to_srgb
 from . import requirements
 from .render import Pixels, draw
 from .shot import Shot, read_shot
@@ -144,8 +145,7 @@ def display(shot: Shot, pixels: Pixels) -> np.ndarray:
     """Straight sRGB [H, W, 4] for a file: the drawn picture, or that over the background."""
     if shot.background is None:
         return pixels.display
-    linear = np.clip(pixels.combined[..., :3], 0, 1)
-    encoded = np.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear ** (1 / 2.4) - 0.055)
+    encoded = linear_to_srgb(pixels.combined[..., :3])
     return np.concatenate([encoded, pixels.combined[..., 3:]], axis=2).astype(np.float32)
 
 

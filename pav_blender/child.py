@@ -1,0 +1,30 @@
+"""`python -m pav_blender.child VERB ...`: a verb that ends when its parent does.
+
+The parent holds the other end of standard input. When that closes (because it wants the work to
+end, or was killed) the verb gets a polite signal to stop, and has a while to save what it has.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+import time
+
+GRACE_S = 30.0
+
+
+def _watch() -> None:
+    while os.read(0, 4096):
+        pass
+    signal.raise_signal(signal.SIGTERM)
+    time.sleep(GRACE_S)
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    from .cli import main
+
+    threading.Thread(target=_watch, daemon=True).start()
+    sys.exit(main(sys.argv[1:]))
