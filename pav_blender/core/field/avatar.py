@@ -16,7 +16,6 @@ import torch
 from ..config import Config
 from ..errors import InputError
 from ..files import replacing
-from ..kernels.reference.encoding import Layout
 from .field import Field
 
 FORMAT = "pav-avatar"
@@ -78,11 +77,12 @@ class Avatar:
             corner_uvs,
             len(canonical_vertices),
         )
+        if "occupied" not in rest:
+            rest["occupied"] = np.ones((len(appearances), *cells), bool)
         values: dict[str, Any] = {
             "rigid_weights": np.ones(len(canonical_vertices), np.float32),
             "box_min": ((low + high) / 2 - size / 2).astype(np.float32),
             "box_size": size,
-            "occupied": np.ones((len(appearances), *cells), bool),
             "head_name": "",
             "head_fingerprint": "",
             "betas": np.zeros(0, np.float32),
@@ -120,7 +120,8 @@ class Avatar:
             "space.occupied": np.packbits(self.occupied.reshape(len(self.appearances), -1), 1),
             "head.betas": np.asarray(self.betas, np.float32),
         }
-        tensors |= {k: torch.from_numpy(np.ascontiguousarray(v)) for k, v in arrays.items()}
+        # copies: safetensors refuses tensors that share memory, as a mesh and its UVs may
+        tensors |= {k: torch.from_numpy(np.array(v, order="C")) for k, v in arrays.items()}
         header = {
             "format": FORMAT,
             "version": VERSION,
@@ -148,9 +149,6 @@ class Avatar:
             raise InputError(f"{path}: {error}") from error
         except (safetensors.SafetensorError, KeyError, TypeError, ValueError, OSError) as error:
             raise InputError(f"{path}: a damaged avatar file ({error})") from error
-        except RuntimeError as error:  # load_state_dict: a list of every mismatch
-            first = str(error).strip().splitlines()[-1].strip()
-            raise InputError(f"{path}: the weights do not fit the settings ({first})") from error
 
 
 def read_header(path: Path | str) -> dict[str, Any]:
@@ -178,6 +176,28 @@ def read_header(path: Path | str) -> dict[str, Any]:
     return header
 
 
+def _check_weights(
+    config: Config, header: dict[str, Any], vertices: int, tensors: dict[str, torch.Tensor]
+) -> None:
+    """InputError unless the settings give just these tensors; nothing is allocated to find out."""
+    with torch.device("meta"):
+        expected = Field(
+            config,
+            len(header["appearances"]),
+            len(header["expression_names"]),
+            torch.zeros(1, 3, dtype=torch.int32),
+            torch.zeros(1, 3, 2),
+            vertices,
+        ).state_dict()
+    for name, tensor in expected.items():
+        found = tensors.get(f"field.{name}")
+        if found is None or found.shape != tensor.shape:
+            shape = None if found is None else tuple(found.shape)
+            raise InputError(
+                f"the weights {name!r} are {shape}, the settings ask for {tuple(tensor.shape)}"
+            )
+
+
 def _assemble(header: dict[str, Any], tensors: dict[str, torch.Tensor]) -> Avatar:
     config = Config.from_json(header["config"])
     appearances = [str(name) for name in header["appearances"]]
@@ -188,17 +208,13 @@ def _assemble(header: dict[str, Any], tensors: dict[str, torch.Tensor]) -> Avata
     vertices, triangles = mesh["canonical_vertices"], mesh["triangles"]
     _check_indices("triangles", triangles, len(vertices))
     _check_indices("uv_triangles", mesh["uv_triangles"], len(mesh["uvs"]))
+    _check_weights(config, header, len(vertices), tensors)
     if len(mesh["rigid_weights"]) != len(vertices):
         raise InputError("rigid_weights and vertices differ in number")
     cells = config.occupancy_resolution
     packed = tensors["space.occupied"].numpy()
     if packed.shape != (len(appearances), -(-(cells**3) // 8)):
         raise InputError(f"the occupancy has shape {packed.shape}; {cells} cells a side expected")
-    entries = Layout(
-        config.levels, config.log2_entries, config.base_resolution, config.finest_resolution
-    ).entries
-    if len(tensors["field.tables"]) != entries:
-        raise InputError(f"{len(tensors['field.tables'])} table entries; expected {entries}")
     bits = np.unpackbits(packed, axis=1, count=cells**3)
     avatar = Avatar.create(
         config,

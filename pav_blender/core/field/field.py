@@ -116,9 +116,7 @@ class Field(nn.Module):
         self.offset: Mlp | None = None
         if config.density_offset and embedding:
             seen = geometry - 1 if config.offset_sees_geometry else 0
-            self.offset = Mlp(
-                embedding + seen, expressions, config.hidden, config.offset_layers, 1
-            )
+            self.offset = Mlp(embedding + seen, expressions, config.hidden, config.offset_layers, 1)
             # starts as no offset: the shared density comes first
             nn.init.zeros_(self.offset.weights[-1])
         self.colour = Mlp(
