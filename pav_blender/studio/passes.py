@@ -15,7 +15,7 @@ from ..core.errors import PavError
 from .nodes import new_material
 
 COLOUR_SAMPLES = 16
-MATTE_SAMPLES = 48
+MATTE_SAMPLES = 32
 
 
 def configure(scene, size: int) -> None:
@@ -46,7 +46,13 @@ def configure(scene, size: int) -> None:
     cycles.denoising_prefilter = "FAST"
     cycles.adaptive_threshold = 0.05
     scene.cycles_curves.shape = "RIBBONS"
-    scene.cycles_curves.subdivisions = 2
+    scene.cycles_curves.subdivisions = 1
+
+
+def _cycles():
+    import _cycles  # only there once Blender has registered Cycles
+
+    return _cycles
 
 
 class Passes:
@@ -56,7 +62,7 @@ class Passes:
         self.scene = scene
         configure(scene, size)
         self.samples = samples or (COLOUR_SAMPLES if size <= 320 else 24)
-        self.denoise = bpy.app.build_options.openimagedenoise
+        self.denoise = bool(getattr(_cycles(), "with_openimagedenoise", False))
         self.flat, graph = new_material("studio flat")
         graph.surface(
             graph.add("Emission", Color=graph.attribute("label").outputs[0], Strength=1.0)
@@ -78,12 +84,12 @@ class Passes:
 
     def matte(self) -> np.ndarray:
         """Coverage [H,W] from many samples of plain emission."""
-        with self._flat(MATTE_SAMPLES, 1.5):
+        with self._flattened(MATTE_SAMPLES, 1.5):
             return self._render()["Combined"][..., 3]
 
     def labels_and_depth(self) -> tuple[np.ndarray, np.ndarray]:
         """Label numbers uint8 [H,W] and camera z [H,W] (inf: nothing) through the pixel centres."""
-        with self._flat(1, 0.01):
+        with self._flattened(1, 0.01):
             layers = self._render()
         labels = np.round(layers["Combined"][..., 0]).astype(np.uint8)
         depth = layers["Depth"][..., 0]
@@ -91,24 +97,19 @@ class Passes:
         return np.where(empty, 0, labels), np.where(empty, np.inf, depth).astype(np.float32)
 
     @contextmanager
-    def _flat(self, samples: int, filter_width: float):
+    def _flattened(self, samples: int, filter_width: float):
         cycles, layer = self.scene.cycles, self.scene.view_layers[0]
         world = self.scene.world
         bounces = cycles.max_bounces
-        hidden = [o for o in self.scene.objects if o.get("studio_see_through")]
         layer.material_override = self.flat
         self.scene.world, cycles.max_bounces = None, 0
         cycles.samples, cycles.filter_width = samples, filter_width
         cycles.use_denoising = cycles.use_adaptive_sampling = False
-        for item in hidden:
-            item.hide_render = True
         try:
             yield
         finally:
             layer.material_override = None
             self.scene.world, cycles.max_bounces = world, bounces
-            for item in hidden:
-                item.hide_render = False
 
     def _render(self) -> dict[str, np.ndarray]:
         path = Path(self.scratch.name) / "frame.exr"

@@ -55,7 +55,8 @@ class Person:
 
     def posed(self, expression: np.ndarray, pose: np.ndarray, translation: np.ndarray) -> np.ndarray:
         """The head model's vertices [V,3] of these parameters."""
-        return np.asarray(self.head.pose(self.betas, expression, pose, translation), np.float32)
+        posed = self.head.pose(self.betas, expression[None], pose[None], translation[None])
+        return np.ascontiguousarray(posed[0].numpy(), np.float32)
 
     def refined(self, posed: np.ndarray) -> np.ndarray:
         return np.asarray(self.matrix @ posed, np.float32)

@@ -7,34 +7,28 @@ from scipy import sparse
 
 
 def quads_of(triangles: np.ndarray) -> np.ndarray:
-    """Faces [N,4] of a triangle list [T,3]; pairs (2i, 2i+1) that share an edge become one quad.
+    """Faces [N,4] of a triangle list [T,3] that was cut from quads; -1 ends a face that was none.
 
-    A triangle that has no partner keeps -1 in its fourth corner.
+    Two orders are known: the halves (a,b,c), (a,c,d) of a quad follow each other, or all first
+    halves come before all second ones.
     """
-    faces: list[tuple[int, int, int, int]] = []
-    i, rows = 0, triangles.tolist()
-    while i < len(rows):
-        merged = _merge(rows[i], rows[i + 1]) if i + 1 < len(rows) else None
-        if merged is None:
-            a, b, c = rows[i]
-            faces.append((a, b, c, -1))
-            i += 1
-        else:
-            faces.append(merged)
-            i += 2
-    return np.asarray(faces, np.int64).reshape(-1, 4)
-
-
-def _merge(first: list[int], second: list[int]) -> tuple[int, int, int, int] | None:
-    shared = set(first) & set(second)
-    apex = set(second) - shared
-    if len(shared) != 2 or len(apex) != 1:
-        return None
-    for k in range(3):  # the edge of `first` that `second` runs through backwards
-        a, b, c = first[k], first[(k + 1) % 3], first[(k + 2) % 3]
-        if {a, b} == shared:
-            return a, apex.pop(), b, c
-    return None
+    step = 1
+    partner = np.flatnonzero(
+        (triangles[:, 0] == triangles[0, 0]) & (triangles[:, 1] == triangles[0, 2])
+    )
+    if len(partner):
+        step = int(partner[0])
+    first = np.arange(len(triangles))
+    first = first[first % 2 == 0] if step == 1 else first[:step]
+    first = first[first + step < len(triangles)]
+    a, b = triangles[first], triangles[first + step]
+    fits = (a[:, 0] == b[:, 0]) & (a[:, 2] == b[:, 1])
+    first = first[fits]
+    quads = np.concatenate([triangles[first], triangles[first + step][:, 2:]], axis=1)
+    alone = np.ones(len(triangles), bool)
+    alone[first] = alone[first + step] = False
+    rest = np.pad(triangles[alone], ((0, 0), (0, 1)), constant_values=-1)
+    return np.concatenate([quads, rest]).astype(np.int64)
 
 
 def subdivide(faces: np.ndarray, count: int) -> tuple[sparse.csr_matrix, np.ndarray]:

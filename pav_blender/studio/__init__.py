@@ -1,0 +1,63 @@
+"""The synthetic person: bpy and Cycles film a head in several appearances and write a collection."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from pathlib import Path
+
+from ..core.errors import InputError
+
+__all__ = ["add_arguments", "render_collection", "run"]
+
+
+def render_collection(out, **options) -> Path:
+    """See :func:`pav_blender.studio.render.render_collection`; raises InputError without bpy."""
+    try:
+        import bpy  # noqa: F401
+    except ImportError as error:
+        raise InputError(
+            "the studio renders with Blender: run it inside Blender or `pip install bpy`"
+        ) from error
+    from .render import render_collection as render
+
+    return render(Path(out), **options)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The arguments of `pav studio`."""
+    parser.add_argument("out", type=Path, metavar="OUT", help="folder of the new collection")
+    parser.add_argument("--appearances", type=int, default=3, help="clips, one a look (1-5)")
+    parser.add_argument("--frames", type=int, default=60, help="pictures a clip")
+    parser.add_argument("--size", type=int, default=256, help="pixels a side")
+    parser.add_argument("--seed", type=int, default=0, help="who it is and what they do")
+    parser.add_argument("--truth", choices=("full", "light"), default="full",
+                        help="full: also depth and posed vertices")  # fmt: skip
+    parser.add_argument("--overwrite", action="store_true", help="replace a collection there")
+
+
+def run(args: argparse.Namespace) -> int:
+    """`pav studio`: renders the collection, progress on stderr; returns the exit code."""
+    lines = bool(getattr(args, "json_progress", False))
+    started = time.monotonic()
+
+    def progress(fraction: float, what: str) -> None:
+        seconds = time.monotonic() - started
+        if lines:
+            record = {"step": what, "fraction": round(fraction, 4), "seconds": round(seconds, 1)}
+            print(json.dumps(record), file=sys.stderr, flush=True)
+        elif sys.stderr.isatty():
+            filled = int(30 * fraction)
+            bar = "#" * filled + "." * (30 - filled)
+            end = "\n" if fraction >= 1 else ""
+            left = seconds / fraction * (1 - fraction)
+            print(f"\r[{bar}] {what:<16} {left:5.0f} s left", end=end, file=sys.stderr, flush=True)
+
+    render_collection(
+        args.out, appearances=args.appearances, frames=args.frames, size=args.size,
+        seed=args.seed, truth=args.truth, overwrite=args.overwrite, progress=progress,
+    )  # fmt: skip
+    print(args.out)
+    return 0

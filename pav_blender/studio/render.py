@@ -1,0 +1,192 @@
+"""Filming a collection: clips of one person, an appearance each, with exact truth beside the pictures."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..core.collection import Clip, CollectionWriter
+from ..core.errors import InputError
+from ..core.head import builtin_head
+from .appearances import APPEARANCES, Appearance, build_scene
+from .camera import intrinsics_of, look_at
+from .identity import identity
+from .motion import perform
+from .passes import Passes, clean_labels, straight_colour
+from .person import Person, build_person
+from .scene import LABEL, StudioScene
+
+VIEWS = (-42.0, -28.0, 28.0, 42.0)  # degrees of orbit of the held-out cameras
+FRAME_HEIGHT = 0.41  # metres that the picture spans at the head's distance
+Progress = Callable[[float, str], None]
+
+
+@dataclass(eq=False)
+class Shot:
+    """One picture to take."""
+
+    frame_id: int
+    split: str
+    expression: np.ndarray
+    pose: np.ndarray
+    translation: np.ndarray
+    intrinsics: np.ndarray
+    camera_to_world: np.ndarray
+
+
+@dataclass(eq=False)
+class Picture:
+    rgba: np.ndarray  # uint8 [H,W,4], straight
+    labels: np.ndarray  # uint8 [H,W]
+    depth: np.ndarray  # float32 [H,W], inf where empty
+    vertices: np.ndarray  # [V,3]
+
+
+def render_collection(
+    out: Path, *, appearances: int = 3, frames: int = 60, size: int = 256, seed: int = 0,
+    views=VIEWS, truth: str = "full", progress: Progress | None = None, overwrite: bool = False,
+    samples: int | None = None,
+) -> Path:  # fmt: skip
+    """Render `appearances` clips of `frames` pictures of `size` x `size` and write a collection.
+
+    `views` are orbit angles in degrees of held-out cameras, one extra picture a clip each. `truth`
+    "full" adds the posed vertices and depth to the parameters, labels and mattes. `progress` gets
+    (fraction done, what). The result depends on the arguments only. Raises InputError.
+    """
+    _check(appearances, frames, size, truth)
+    head = builtin_head()
+    person = build_person(head, identity(head, seed))
+    looks = APPEARANCES[:appearances]
+    total, done = appearances * (frames + len(views)), 0
+    extra = {"made_by": "pav studio", "seed": seed, "frames": frames, "truth": truth}
+    with CollectionWriter(out, "builtin", person.betas, extra=extra, overwrite=overwrite) as writer:
+        for look in looks:
+            shots = plan(person, look, frames, size, seed, views)
+            vertices = []
+            with filming(person, look, size, seed, samples) as take:
+                for shot in shots:
+                    picture = take(shot)
+                    writer.image(look.name, shot.frame_id, picture.rgba)
+                    writer.labels(look.name, shot.frame_id, picture.labels)
+                    if truth == "full":
+                        writer.depth(look.name, shot.frame_id, picture.depth)
+                        vertices.append(picture.vertices)
+                    done += 1
+                    if progress:
+                        progress(done / total, f"{look.name} {shot.frame_id}")
+            writer.clip(_clip(look, shots, size, vertices))
+    return Path(out)
+
+
+def _check(appearances: int, frames: int, size: int, truth: str) -> None:
+    for what, value, low, high in (
+        ("appearances", appearances, 1, len(APPEARANCES)),
+        ("frames", frames, 2, 100_000),
+        ("size", size, 32, 4096),
+    ):
+        if not low <= value <= high:
+            raise InputError(f"{what} {value}: give {low} to {high}")
+    if truth not in ("full", "light"):
+        raise InputError(f"truth {truth!r}: use 'full' or 'light'")
+
+
+def plan(
+    person: Person, look: Appearance, frames: int, size: int, seed: int, views=VIEWS
+) -> list[Shot]:
+    """The shots of one clip: training frames, the last sixth held out, then other cameras."""
+    rng = np.random.default_rng([seed, 100 + APPEARANCES.index(look)])
+    motion = perform(person.head, frames, rng)
+    height = FRAME_HEIGHT * rng.uniform(0.97, 1.04)
+    distance = rng.uniform(1.05, 1.35)
+    intrinsics = intrinsics_of(size * distance / height, size)
+    middle = person.joints[1] * [1, 0, 1] + [0, 0.1 * person.landmarks.chin[1] - 0.012, 0.02]
+    azimuth, elevation = rng.uniform(-6, 6), rng.uniform(-3, 6)
+    held_out = max(1, round(frames / 6))
+    shots = []
+    drift = 0.25 * np.stack(
+        [np.sin(np.arange(frames) / rng.uniform(9, 15) + rng.uniform(0, 6)) for _ in range(2)], 1
+    )
+    for k in range(frames):
+        view = orbit(middle, distance, azimuth + drift[k, 0], elevation + drift[k, 1])
+        split = "test" if k >= frames - held_out else "train"
+        shots.append(
+            Shot(k, split, motion.expression[k], motion.pose[k], motion.translation[k],
+                 intrinsics, view)
+        )  # fmt: skip
+    chosen = np.linspace(0, frames - held_out - 1, len(views) + 2)[1:-1].round().astype(int)
+    for number, (angle, k) in enumerate(zip(views, chosen, strict=True)):
+        view = orbit(middle, distance, angle, elevation + rng.uniform(-4, 8))
+        shots.append(
+            Shot(frames + number, "view", motion.expression[k], motion.pose[k],
+                 motion.translation[k], intrinsics, view)
+        )  # fmt: skip
+    return shots
+
+
+def orbit(target: np.ndarray, distance: float, azimuth: float, elevation: float) -> np.ndarray:
+    """camera_to_world of a camera round `target`; degrees, azimuth + is the person's left."""
+    a, e = np.radians([azimuth, elevation])
+    away = np.array([np.sin(a) * np.cos(e), np.sin(e), np.cos(a) * np.cos(e)])
+    return look_at(target + distance * away, target)
+
+
+@contextlib.contextmanager
+def filming(
+    person: Person, look: Appearance, size: int, seed: int, samples: int | None = None
+) -> Iterator[Callable[[Shot], Picture]]:
+    """Builds the appearance's scene; yields a function that takes one picture."""
+    studio = build_scene(person, look, seed)
+    passes = Passes(studio.scene, size, samples)
+    try:
+        yield lambda shot: _take(studio, passes, shot, size)
+    finally:
+        passes.close()
+        studio.close()
+
+
+def _take(studio: StudioScene, passes: Passes, shot: Shot, size: int) -> Picture:
+    posed = studio.pose(shot.expression, shot.pose, shot.translation)
+    studio.aim(shot.intrinsics, shot.camera_to_world, size)
+    with quiet():
+        colour, matte = passes.colour(), passes.matte()
+        labels, depth = passes.labels_and_depth()
+    labels = clean_labels(labels, matte, (LABEL["scalp_hair"], LABEL["facial_hair"]))
+    straight = np.concatenate([straight_colour(colour), matte[..., None]], axis=2)
+    rgba = np.round(255 * np.clip(straight, 0, 1)).astype(np.uint8)
+    rgba[rgba[..., 3] == 0] = 0
+    return Picture(rgba, labels, depth, posed)
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Blender's lines about saved files go nowhere while this holds."""
+    sys.stdout.flush()
+    saved, sink = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(sink, 1)
+    try:
+        yield
+    finally:
+        os.dup2(saved, 1)
+        os.close(saved)
+        os.close(sink)
+
+
+def _clip(look: Appearance, shots: list[Shot], size: int, vertices: list[np.ndarray]) -> Clip:
+    def stacked(name: str) -> np.ndarray:
+        return np.stack([getattr(shot, name) for shot in shots])
+
+    return Clip(
+        name=look.name, appearance=look.name, width=size, height=size,
+        expression=stacked("expression"), pose=stacked("pose"),
+        translation=stacked("translation"), intrinsics=stacked("intrinsics"),
+        camera_to_world=stacked("camera_to_world"),
+        frame_id=np.array([shot.frame_id for shot in shots], np.int32),
+        split=np.array([shot.split for shot in shots]),
+        vertices=np.stack(vertices) if vertices else None,
+    )  # fmt: skip
