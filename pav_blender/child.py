@@ -18,7 +18,11 @@ GRACE_S = 30.0
 def _watch() -> None:
     while os.read(0, 4096):
         pass
-    signal.raise_signal(signal.SIGTERM)
+    main_thread = threading.main_thread().ident
+    if hasattr(signal, "pthread_kill") and main_thread:  # wakes it even if it sleeps
+        signal.pthread_kill(main_thread, signal.SIGTERM)
+    else:
+        signal.raise_signal(signal.SIGTERM)
     time.sleep(GRACE_S)
     os._exit(1)
 

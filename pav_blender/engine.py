@@ -1,4 +1,4 @@
-"""The render engine: a thin class over `bridge.final`."""
+"""The render engine: a thin class over `bridge.final` (F12) and `bridge.viewport`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any
 
 import bpy
 
-from .bridge import final
+from .bridge import final, viewport
 
 
 class PavRenderEngine(bpy.types.RenderEngine):
@@ -20,6 +20,7 @@ class PavRenderEngine(bpy.types.RenderEngine):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
+        self.view: viewport.View | None = None
 
     def update_render_passes(self, scene: Any, renderlayer: Any) -> None:
         self.register_pass(scene, renderlayer, "Combined", 4, "RGBA", "COLOR")
@@ -28,6 +29,14 @@ class PavRenderEngine(bpy.types.RenderEngine):
 
     def render(self, depsgraph: Any) -> None:
         final.render(self, depsgraph)
+
+    def view_update(self, context: Any, depsgraph: Any) -> None:
+        self.view = self.view or viewport.View()
+        self.view.update(depsgraph)
+
+    def view_draw(self, context: Any, depsgraph: Any) -> None:
+        if self.view is not None:
+            viewport.draw_view(self, self.view, context, depsgraph.scene_eval)
 
 
 # Panels of Blender that mean nothing for this engine
@@ -64,4 +73,5 @@ def unregister() -> None:
     for panel in _shared_panels():
         panel.COMPAT_ENGINES.discard(PavRenderEngine.bl_idname)
     bpy.utils.unregister_class(PavRenderEngine)
+    viewport.unregister()
     final.unregister()

@@ -26,7 +26,7 @@ def render(engine: Any, depsgraph: Any) -> None:
     try:
         requirements.check()
         shot = read_shot(engine, depsgraph)
-        engine.update_stats("", f"PAV: {shot.width}x{shot.height}")
+        engine.update_stats("", f"PAV: {shot.camera.width}x{shot.camera.height}")
         pixels = draw(shot, engine.update_progress, engine.test_break)
     except Cancelled:
         return

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -83,12 +83,15 @@ def _draw_actor(
 
     avatar = avatars.load(actor.avatar)
     check_topology(actor, avatar)
+    settings = RenderSettings.preset(shot.quality)
+    if shot.chunk:
+        settings = replace(settings, chunk=shot.chunk)
     picture = render(
         avatar,
         actor.vertices,
-        actor.camera,
+        actor.seen_by(shot.camera),
         actor.appearance or avatar.appearances[0],
-        RenderSettings.preset(shot.quality),
+        settings,
         region=shot.region,
         progress=progress,
         should_stop=should_stop,

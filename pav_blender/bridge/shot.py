@@ -17,9 +17,9 @@ from .lens import frame_size, from_projection
 
 @dataclass(frozen=True, eq=False)
 class Actor:
-    """A head to draw. vertices [V, 3] float32 metres and camera in the head's own space (see
-    `mesh.placement`); scale: world metres in a metre of that space; expression: shape key values
-    by name; triangles [T, 3] for the check against the avatar."""
+    """A head to draw. vertices [V, 3] float32 metres in the head's own space, which `rigid` and
+    `scale` place in the world (see `mesh.placement`); expression: shape key values by name;
+    triangles [T, 3] for the check against the avatar; appearance None: the avatar's first."""
 
     name: str
     avatar: Path
@@ -27,21 +27,28 @@ class Actor:
     vertices: np.ndarray
     triangles: np.ndarray
     expression: dict[str, float]
-    camera: Camera
+    rigid: np.ndarray
     scale: float
+
+    def seen_by(self, camera: Camera) -> Camera:
+        """A camera of the world as it stands to the head's own space."""
+        pose = np.linalg.inv(self.rigid) @ camera.camera_to_world
+        pose[:3, 3] /= self.scale
+        return replace(camera, camera_to_world=pose)
 
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """One picture: `region` (x0, y0, x1, y1) of a width x height frame, top-left origin; quality
-    a preset's name; background scene-linear RGB, None for a transparent film."""
+    """One picture: the `region` (x0, y0, x1, y1) of what `camera` (world, core axes) sees,
+    top-left origin; quality: a preset's name; background: scene-linear RGB, None for a transparent
+    film; chunk: rays between two looks at whether to stop, 0 for the renderer's own."""
 
     actors: tuple[Actor, ...]
-    width: int
-    height: int
+    camera: Camera
     region: tuple[int, int, int, int]
     quality: str
     background: tuple[float, float, float] | None
+    chunk: int = 0
 
 
 def border(render: Any, width: int, height: int) -> tuple[int, int, int, int]:
@@ -72,6 +79,11 @@ def world_colour(world: Any) -> tuple[float, float, float]:
     return tuple(world.color)
 
 
+def film_background(scene: Any) -> tuple[float, float, float] | None:
+    """What a render of the scene shows where no avatar is: None for a transparent film."""
+    return None if scene.render.film_transparent else world_colour(scene.world)
+
+
 def scene_camera(engine: Any, camera: Any, depsgraph: Any, width: int, height: int) -> Camera:
     """The camera of a final render in world space, core axes.
 
@@ -95,25 +107,23 @@ def scene_camera(engine: Any, camera: Any, depsgraph: Any, width: int, height: i
     return Camera(width, height, intrinsics, camera_to_core(matrix))
 
 
-def find_actors(depsgraph: Any, camera: Camera) -> tuple[Actor, ...]:
+def find_actors(depsgraph: Any) -> tuple[Actor, ...]:
     """Every visible object (or instance of one) that has an avatar file, ready to draw."""
     actors = []
     for instance in depsgraph.object_instances:
         evaluated = instance.object
         if evaluated.type == "MESH" and evaluated.pav.avatar and instance.show_self:
-            actors.append(read_actor(evaluated, instance.matrix_world, depsgraph, camera))
+            actors.append(read_actor(evaluated, instance.matrix_world, depsgraph))
     return tuple(actors)
 
 
-def read_actor(evaluated: Any, matrix_world: Any, depsgraph: Any, camera: Camera) -> Actor:
-    """One evaluated mesh object as an actor seen by `camera` (world space)."""
+def read_actor(evaluated: Any, matrix_world: Any, depsgraph: Any) -> Actor:
+    """One evaluated mesh object as an actor. InputError for a scale of zero or a wrong choice."""
     original = evaluated.original
     try:
         rigid, stretch, scale = mesh.placement(np.array(matrix_world))
     except ValueError as error:
         raise InputError(f"object {original.name!r}: {error}") from error
-    pose = np.linalg.inv(rigid) @ camera.camera_to_world
-    pose[:3, 3] /= scale
     points = mesh.evaluated_vertices(evaluated)
     if not np.allclose(stretch, np.eye(3), atol=1e-6):
         points = np.ascontiguousarray(points @ stretch.T, np.float32)
@@ -124,7 +134,7 @@ def read_actor(evaluated: Any, matrix_world: Any, depsgraph: Any, camera: Camera
         vertices=points,
         triangles=mesh.triangles(evaluated.data),
         expression=_key_values(original, depsgraph),
-        camera=replace(camera, camera_to_world=pose),
+        rigid=rigid,
         scale=scale,
     )
 
@@ -139,20 +149,18 @@ def read_shot(engine: Any, depsgraph: Any) -> Shot:
         raise InputError("PAV renders one view; switch stereoscopy off")
     width, height = frame_size(scene.render)
     camera = scene_camera(engine, camera_object, depsgraph, width, height)
-    actors = find_actors(depsgraph, camera)
+    actors = find_actors(depsgraph)
     if not actors:
         raise InputError(
             f"scene {scene.name!r} shows no avatar: choose an avatar file for a head in the "
             "sidebar's PAV tab, and check that the head is visible in renders"
         )
-    background = None if scene.render.film_transparent else world_colour(scene.world)
     return Shot(
         actors,
-        width,
-        height,
+        camera,
         border(scene.render, width, height),
-        depsgraph.scene.pav.quality.lower(),
-        background,
+        scene.pav.quality.lower(),
+        film_background(scene),
     )
 
 

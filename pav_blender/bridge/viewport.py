@@ -1,0 +1,216 @@
+"""The rendered 3D view: a coarse picture at once, finer ones from a thread.
+
+Blender's data is copied when it changes; the thread sees copies only and never touches the engine,
+which Blender frees without notice. It leaves its picture and raises a flag that a timer turns into
+a redraw.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import bpy
+import numpy as np
+
+from ..core.errors import Cancelled, PavError
+from ..core.rendering.cameras import Camera
+from . import requirements
+from .axes import camera_to_core
+from .lens import from_projection
+from .render import Pixels, draw
+from .shot import Actor, Shot, film_background, find_actors
+
+ORTHO_DISTANCE = 50.0  # metres; from there a perspective view is as good as a parallel one
+_COARSE_S = 0.06  # what the first picture of a new view may take, while the user waits for it
+_CHUNK = 2048
+_POLL_S = 1 / 30
+_SHARES = (1 / 8, 1 / 4, 1 / 2, 1)  # of the view's sides
+
+_wake = threading.Condition()
+_waiting: list[View] = []
+_finished = threading.Event()
+_drawing = threading.Lock()  # one picture at a time; the renderer uses every core for each
+_rate = 20_000.0  # pixels a second, as measured
+_thread: threading.Thread | None = None
+
+
+@dataclass(eq=False)
+class View:
+    """The state of one rendered 3D view. `shot` is what it should show, `pixels` what it has."""
+
+    actors: tuple[Actor, ...] = ()
+    background: tuple[float, float, float] | None = None
+    shot: Shot | None = None
+    pixels: Pixels | None = None
+    message: str = ""
+    changed: bool = True
+    shown: Pixels | None = None
+    texture: Any = None
+    _next: int = field(default=0)
+
+    def update(self, depsgraph: Any) -> None:
+        """Takes a copy of what is to be drawn."""
+        self.changed, self.message = True, ""
+        try:
+            requirements.check()
+            self.actors = find_actors(depsgraph)
+            self.background = film_background(depsgraph.scene_eval)
+            if not self.actors:
+                self.message = "No avatar in view: choose an avatar file in the PAV tab"
+        except PavError as error:
+            self.actors, self.message = (), str(error)
+
+    def look(self, camera: Camera) -> None:
+        """Brings the picture to the camera: nothing if it has it, else the coarse one now and the
+        finer ones later."""
+        if not self.actors:
+            self.shot = self.pixels = None
+            return
+        if not self.changed and self.shot is not None and _same(self.shot.camera, camera):
+            return
+        self.changed = False
+        whole = (0, 0, camera.width, camera.height)
+        self.shot = Shot(self.actors, camera, whole, "preview", self.background, _CHUNK)
+        # the thread's picture is of another view now: it stops within a chunk
+        self._next = _coarsest(camera)
+        with _drawing:
+            self._draw(self.shot, self._next)
+        if not self.message and self._next + 1 < len(_SHARES):
+            self._next += 1
+            _ask(self)
+
+    def refine(self) -> None:
+        """On the thread: the next finer picture, and so on until the view changes."""
+        shot, share = self.shot, self._next
+        while shot is not None and shot is self.shot and share < len(_SHARES) and not self.message:
+            with _drawing:
+                self._draw(shot, share)
+            _finished.set()
+            share += 1
+
+    def _draw(self, shot: Shot, share: int) -> None:
+        global _rate
+        part = _SHARES[share]
+        camera = shot.camera.resized(
+            max(1, round(shot.camera.width * part)), max(1, round(shot.camera.height * part))
+        )
+        region = (0, 0, camera.width, camera.height)
+        smaller = replace(shot, camera=camera, region=region)
+        begun = time.perf_counter()
+        try:
+            pixels = draw(smaller, should_stop=lambda: shot is not self.shot)
+        except Cancelled:
+            return
+        except Exception as error:
+            self.message = str(error) or type(error).__name__
+            return
+        _rate = camera.width * camera.height / max(time.perf_counter() - begun, 1e-4)
+        if shot is self.shot:
+            self.pixels = pixels
+
+
+def view_camera(region: Any, region_data: Any) -> Camera:
+    """The camera of a 3D view in core axes; a parallel view is seen from far away."""
+    matrix = np.array(region_data.view_matrix.inverted())
+    projection = np.array(region_data.window_matrix)
+    width, height = region.width, region.height
+    if region_data.is_perspective or abs(projection[3, 2] + 1) < 1e-6:
+        intrinsics = from_projection(projection, width, height)
+        return Camera(width, height, intrinsics, camera_to_core(matrix))
+    intrinsics = np.array(
+        [
+            [projection[0, 0] * width / 2 * ORTHO_DISTANCE, 0, (1 + projection[0, 3]) * width / 2],
+            [
+                0,
+                projection[1, 1] * height / 2 * ORTHO_DISTANCE,
+                (1 - projection[1, 3]) * height / 2,
+            ],
+            [0, 0, 1],
+        ]
+    )
+    focus = np.array(region_data.view_location)
+    back = matrix[:3, 2]
+    # the plane through the point that the view turns about keeps its size
+    matrix[:3, 3] += back * (ORTHO_DISTANCE - back @ (matrix[:3, 3] - focus))
+    return Camera(width, height, intrinsics, camera_to_core(matrix))
+
+
+def draw_view(engine: Any, view: View, context: Any, scene: Any) -> None:
+    """Called inside Blender's drawing: puts the newest picture into the 3D view."""
+    import gpu
+    from gpu_extras.presets import draw_texture_2d
+
+    view.look(view_camera(context.region, context.region_data))
+    engine.update_stats("PAV", view.message)
+    pixels = view.pixels
+    if pixels is None:
+        return
+    if pixels is not view.shown:
+        height, width = pixels.depth.shape
+        flat = np.ascontiguousarray(pixels.combined[::-1], np.float32).ravel()
+        buffer = gpu.types.Buffer("FLOAT", len(flat), flat)
+        view.texture = gpu.types.GPUTexture((width, height), format="RGBA16F", data=buffer)
+        view.shown = pixels
+    gpu.state.blend_set("ALPHA_PREMULT")
+    engine.bind_display_space_shader(scene)
+    draw_texture_2d(view.texture, (0, 0), context.region.width, context.region.height)
+    engine.unbind_display_space_shader()
+    gpu.state.blend_set("NONE")
+
+
+def _coarsest(camera: Camera) -> int:
+    """The finest picture that is ready soon enough to be waited for."""
+    affordable = _rate * _COARSE_S
+    fitting = [
+        i for i, part in enumerate(_SHARES) if camera.width * camera.height * part**2 <= affordable
+    ]
+    return fitting[-1] if fitting else 0
+
+
+def _same(one: Camera, other: Camera) -> bool:
+    return (
+        (one.width, one.height) == (other.width, other.height)
+        and np.allclose(one.intrinsics, other.intrinsics, atol=1e-4)
+        and np.allclose(one.camera_to_world, other.camera_to_world, atol=1e-7)
+    )
+
+
+def _ask(view: View) -> None:
+    global _thread
+    with _wake:
+        _waiting[:] = [other for other in _waiting if other is not view] + [view]
+        _wake.notify()
+    if _thread is None:
+        _thread = threading.Thread(target=_work, daemon=True)
+        _thread.start()
+    if not bpy.app.timers.is_registered(_poll):
+        bpy.app.timers.register(_poll, persistent=True)
+
+
+def _work() -> None:
+    while True:
+        with _wake:
+            while not _waiting:
+                _wake.wait()
+            view = _waiting.pop(0)
+        view.refine()
+
+
+def _poll() -> float:
+    if _finished.is_set():
+        _finished.clear()
+        for window in bpy.context.window_manager.windows:
+            for area in window.screen.areas:
+                if area.type == "VIEW_3D":
+                    area.tag_redraw()
+    return _POLL_S
+
+
+def unregister() -> None:
+    if bpy.app.timers.is_registered(_poll):
+        bpy.app.timers.unregister(_poll)
+    with _wake:
+        _waiting.clear()

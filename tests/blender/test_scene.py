@@ -1,0 +1,192 @@
+"""`pav scene`, the operators, and writing sequences."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("bpy")
+
+import bpy
+import small
+
+from pav_blender.bridge import jobs, mesh, sequence
+from pav_blender.bridge import scene as bridge_scene
+from pav_blender.core import images
+from pav_blender.core.collection import read_collection
+from pav_blender.core.errors import InputError
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("files")
+    small.write_avatar(folder / "small.pav")
+    small.write_collection(folder / "collection")
+    return folder
+
+
+def pav(*arguments, cwd):
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    return subprocess.run(
+        [sys.executable, "-m", "pav_blender", *map(str, arguments)],
+        env=environment,
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+
+
+def test_verb_writes_a_blend_that_opens_with_everything_set(registered, files):
+    out = files / "blends" / "walk.blend"
+    out.parent.mkdir()
+    arguments = ("--track", "collection:walk", "--out", "blends/walk.blend")
+    done = pav("scene", "small.pav", *arguments, "--appearance", "evening", "--fps", 30, cwd=files)
+    assert done.returncode == 0, done.stderr
+    assert [path.name for path in out.parent.iterdir()] == ["walk.blend"]
+
+    bpy.ops.wm.open_mainfile(filepath=str(out))
+    scene = bpy.context.scene
+    assert scene.render.engine == "PAV"
+    assert (scene.frame_start, scene.frame_end, scene.render.fps) == (3, 6, 30)
+    assert (scene.render.resolution_x, scene.render.resolution_y) == (48, 40)
+    assert scene.view_settings.view_transform == "Standard"
+    assert scene.render.film_transparent
+    (head,) = [object_ for object_ in scene.objects if object_.pav.avatar]
+    assert (head.pav.avatar, head.pav.appearance) == ("//../small.pav", "evening")
+
+    collection = read_collection(files / "collection")
+    clip = collection.clip("walk")
+    posed = collection.posed(clip, np.arange(len(clip)))
+    for row, frame in enumerate(clip.frame_id):
+        scene.frame_set(int(frame))
+        evaluated = head.evaluated_get(bpy.context.evaluated_depsgraph_get())
+        distance = np.linalg.norm(mesh.evaluated_vertices(evaluated) - posed[row], axis=1)
+        assert distance.max() < 5e-5
+    bpy.ops.wm.read_homefile(use_factory_startup=True, use_empty=True)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("gone.pav", "--track", "collection:walk", "--out", "a.blend"), "gone.pav"),
+        (("small.pav", "--track", "collection:run", "--out", "a.blend"), "no clip named 'run'"),
+        (("small.pav", "--track", "nowhere:walk", "--out", "a.blend"), "no such collection"),
+        (("small.pav", "--track", "collection", "--out", "a.blend"), "COLLECTION:CLIP"),
+        (("small.pav", "--track", "collection:walk", "--out", "a.png"), "ends in .blend"),
+        (("small.pav", "--track", "collection:walk", "--out", "no/a.blend"), "no such folder"),
+        (
+            ("small.pav", "--track", "collection:walk", "--out", "a.blend", "--appearance", "x"),
+            "morning, evening",
+        ),
+        (("small.pav", "--track", "collection:walk", "--out", "a.blend", "--fps", "0"), "above 0"),
+    ],
+)
+def test_verb_refuses_wrong_input_in_one_line(files, arguments, message):
+    before = sorted(files.rglob("*"))
+    done = pav("scene", *arguments, cwd=files)
+    assert done.returncode == 2
+    (line,) = [line for line in done.stderr.splitlines() if line.startswith("pav")]
+    assert message in line
+    assert "Traceback" not in done.stderr
+    assert sorted(files.rglob("*")) == before
+
+
+def test_operators_add_a_head_and_import_a_track(scene, files):
+    bpy.ops.pav.add_head(filepath=str(files / "small.pav"))
+    head = bpy.context.object
+    assert head.pav.appearance == "morning"
+    assert scene.render.engine == "PAV"
+    scene.pav.collection = str(files / "collection")
+    bpy.ops.pav.import_track()
+    assert scene.camera is not None
+    assert head.data.shape_keys.animation_data.action is not None
+    bpy.ops.pav.import_track()  # again: replaces, adds no second camera
+    assert len([object_ for object_ in scene.objects if object_.type == "CAMERA"]) == 1
+
+
+def test_operators_say_what_is_wrong(scene, files):
+    with pytest.raises(RuntimeError, match=r"gone\.pav: no such avatar file"):
+        bpy.ops.pav.add_head(filepath=str(files / "gone.pav"))
+    assert len(bpy.data.objects) == 0
+    bpy.ops.pav.add_head(filepath=str(files / "small.pav"))
+    with pytest.raises(RuntimeError, match="choose the collection"):
+        bpy.ops.pav.import_track()
+    scene.pav.collection = str(files)
+    with pytest.raises(RuntimeError, match="not a collection"):
+        bpy.ops.pav.import_track()
+    scene.pav.collection, scene.pav.clip = str(files / "collection"), "run"
+    with pytest.raises(RuntimeError, match="no clip named 'run'"):
+        bpy.ops.pav.import_track()
+    with pytest.raises(RuntimeError, match="avatar file to write"):
+        bpy.ops.pav.train()
+
+
+def test_a_track_of_another_head_is_refused(scene, files):
+    bpy.ops.pav.add_head(filepath=str(files / "small.pav"))
+    head = bpy.context.object
+    head.data.shape_keys.key_blocks["jawOpen"].name = "mouth"
+    with pytest.raises(InputError, match="no shape key 'jawOpen'"):
+        bridge_scene.import_track(head, read_collection(files / "collection"), "walk")
+
+
+def test_writing_frames_goes_on_where_it_stopped(scene, files, tmp_path):
+    collection = read_collection(files / "collection")
+    bridge_scene.build_scene(files / "small.pav", collection, "walk")
+    scene.pav.quality = "PREVIEW"
+    scene.render.filepath = str(tmp_path / "frames") + "/"
+    bpy.ops.pav.write_sequence()
+    names = [f"{frame:06d}.png" for frame in (3, 4, 5, 6)]
+    assert sorted(path.name for path in (tmp_path / "frames").iterdir()) == names
+    first, second, third, _ = (tmp_path / "frames" / name for name in names)
+    scene.render.filepath = str(tmp_path / "f12.png")
+    scene.frame_set(4)
+    bpy.ops.render.render(write_still=True)
+    difference = images.read_rgba(second).astype(int) - images.read_rgba(tmp_path / "f12.png")
+    assert np.abs(difference).max() <= 1
+
+    whole = second.read_bytes()
+    first.write_bytes(b"")  # a placeholder left behind
+    second.write_bytes(whole[: len(whole) // 2])  # and a torn file
+    untouched = third.stat().st_mtime_ns
+    scene.render.filepath = str(tmp_path / "frames") + "/"
+    work = sequence.begin(scene, tmp_path / "frames")
+    sequence.blocking(work, lambda message: None)
+    assert (work.kept, work.error) == (2, "")
+    assert second.read_bytes() == whole
+    assert third.stat().st_mtime_ns == untouched
+    assert images.read_rgba(first).shape == (40, 48, 4)
+
+
+def test_writing_frames_stops_at_the_first_fault(scene, files, tmp_path):
+    collection = read_collection(files / "collection")
+    made = bridge_scene.build_scene(files / "small.pav", collection, "walk")
+    made.mesh.pav.avatar = str(files / "gone.pav")
+    scene.render.filepath = str(tmp_path) + "/"
+    with pytest.raises(RuntimeError, match=r"frame 3: .*gone\.pav"):
+        bpy.ops.pav.write_sequence()
+    assert list(tmp_path.iterdir()) == []
+    assert jobs.current().status.startswith("frame 3")
+
+
+def test_opaque_frames_hold_the_world_as_f12_does(scene, files, tmp_path):
+    collection = read_collection(files / "collection")
+    bridge_scene.build_scene(files / "small.pav", collection, "walk")
+    scene.pav.quality, scene.render.film_transparent = "PREVIEW", False
+    scene.world = bpy.data.worlds.new("World")
+    scene.world.color = 0.2, 0.5, 0.05
+    scene.frame_end = scene.frame_start
+    scene.render.filepath = str(tmp_path / "frames")
+    bpy.ops.pav.write_sequence()
+    scene.render.filepath = str(tmp_path / "f12.png")
+    bpy.ops.render.render(write_still=True)
+    frames = [tmp_path / "frames" / "000003.png", tmp_path / "f12.png"]
+    written, rendered = (images.read_rgba(path).astype(int) for path in frames)
+    assert np.abs(written - rendered).max() <= 1
