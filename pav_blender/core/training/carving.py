@@ -7,12 +7,13 @@ of an appearance, it falls inside the mattes.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from scipy import ndimage
 
-from ..deformation import Deformer, canonicalise
-from ..kernels.structures import PosedMesh
+from ..deformation import Deformer, triangle_maps
 from .frames import Frame
 
 _MISSES = 0.12  # part of the pictures that may disagree: mattes and tracks are not exact
@@ -52,7 +53,7 @@ def carve(
     box_size: float,
     cells: int,
     *,
-    most_frames: int = 32,
+    most_frames: int = 24,
 ) -> np.ndarray:
     """Cells [G, G, G] bool that the mattes of `frames` (one appearance) leave.
 
@@ -60,62 +61,53 @@ def carve(
     """
     side = box_size / cells
     centres = (np.indices((cells,) * 3).reshape(3, -1).T + 0.5) * side + box_min
-    points = torch.from_numpy(centres.astype(np.float32))
-    rest = Deformer(canonical, triangles, "affine")
-    near, triangle, barycentric = _band(rest, canonical, triangles, points, reach + side)
-    chosen = frames[:: max(1, len(frames) // most_frames)]
-    seen = np.zeros(len(near), np.int32)
-    missed = np.zeros(len(near), np.int32)
+    band = _band(canonical, triangles, centres.astype(np.float32), reach + side)
+    chosen = frames[:: max(1, -(-len(frames) // most_frames))]
+    seen = np.zeros(len(band.row), np.int32)
+    missed = np.zeros(len(band.row), np.int32)
     for frame in chosen:
-        posed = _carry(canonical, frame.vertices, rest, points[near], triangle, barycentric)
-        _count(frame, posed, side, seen, missed)
+        _count(frame, _carry(canonical, frame, triangles, band), side, seen, missed)
     kept = np.zeros(cells**3, bool)
-    kept[near.numpy()] = (seen > 0) & (missed <= _MISSES * seen)
+    kept[band.row] = (seen > 0) & (missed <= _MISSES * seen)
     return ndimage.binary_dilation(kept.reshape((cells,) * 3))
 
 
-def _band(
-    rest: Deformer,
-    canonical: np.ndarray,
-    triangles: np.ndarray,
-    points: torch.Tensor,
-    reach: float,
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Rows of the points near the mesh and not deep inside it, their triangle and barycentrics."""
-    mesh = rest.pose(canonical)
-    triangle, barycentric, distance = rest.nearest(mesh, points)
-    corners = canonical[triangles[triangle.numpy()]].astype(np.float64)
+@dataclass(eq=False)
+class _Band:
+    """Cells near the mesh and not deep inside it: flat row, centre, nearest triangle."""
+
+    row: np.ndarray
+    points: np.ndarray
+    triangle: np.ndarray
+
+
+def _band(canonical: np.ndarray, triangles: np.ndarray, points: np.ndarray, reach: float) -> _Band:
+    deformer = Deformer(canonical, triangles, "affine")
+    nearest = deformer.nearest(deformer.pose(canonical), torch.from_numpy(points))
+    triangle, barycentric, distance = (values.numpy() for values in nearest)
+    corners = canonical[triangles[triangle]]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    foot = (corners * barycentric.numpy()[:, :, None]).sum(1)
-    inside = ((points.numpy() - foot) * normal).sum(1) < 0
-    far = distance.numpy() > np.where(inside, _INSIDE, reach)
-    near = torch.from_numpy(np.flatnonzero(~far))
-    return near, triangle[near], barycentric[near]
+    foot = (corners * barycentric[:, :, None]).sum(1)
+    inside = ((points - foot) * normal).sum(1) < 0
+    row = np.flatnonzero(distance <= np.where(inside, _INSIDE, reach))
+    return _Band(row, points[row], triangle[row])
 
 
-def _carry(
-    canonical: np.ndarray,
-    vertices: np.ndarray,
-    rest: Deformer,
-    points: torch.Tensor,
-    triangle: torch.Tensor,
-    barycentric: torch.Tensor,
-) -> np.ndarray:
-    """Canonical points into a pose: the canonicalisation with the two meshes changed over."""
-    back = Deformer(vertices, rest.triangles, "affine")
-    mesh: PosedMesh = back.pose(canonical)
-    moved = canonicalise(points, triangle, barycentric, mesh).numpy()
-    # a nearly flat triangle may throw points far off: those say nothing
-    foot = (
-        vertices[rest.triangles.numpy()[triangle.numpy()]] * barycentric.numpy()[:, :, None]
-    ).sum(1)
-    rest_foot = (
-        canonical[rest.triangles.numpy()[triangle.numpy()]] * barycentric.numpy()[:, :, None]
-    ).sum(1)
-    reach = np.linalg.norm(moved - foot, axis=1)
-    before = np.linalg.norm(points.numpy() - rest_foot, axis=1)
-    moved[reach > _LARGEST_STRETCH * before + 1e-3] = np.nan
-    return moved
+def _carry(canonical: np.ndarray, frame: Frame, triangles: np.ndarray, band: _Band) -> np.ndarray:
+    """Canonical points into a frame's pose: the canonicalisation with the meshes changed over.
+
+    nan where a nearly flat triangle throws a point far off: that says nothing.
+    """
+    maps = triangle_maps(
+        torch.from_numpy(frame.vertices),
+        torch.from_numpy(canonical),
+        torch.from_numpy(triangles),
+        "affine",
+    ).numpy()
+    scale = np.linalg.norm(maps[:, :, :3], axis=1).max(1)
+    maps[scale > _LARGEST_STRETCH] = np.nan
+    chosen = maps[band.triangle]
+    return np.einsum("nij,nj->ni", chosen[:, :, :3], band.points) + chosen[:, :, 3]
 
 
 def _count(

@@ -16,23 +16,15 @@ from .frames import Frame, load_frames
 def load_training_frames(collection: Collection, progress: Report | None = None) -> list[Frame]:
     """Every frame of the "train" split; InputError where an appearance has none."""
     frames: list[Frame] = []
-    total = sum(len(clip.indices("train")) for clip in collection.clips)
+    total = max(1, sum(len(clip.indices("train")) for clip in collection.clips))
+
+    def report(part: float, **fields: object) -> None:
+        if progress:
+            progress((len(frames) + part * len(rows)) / total, **fields)
+
     for clip in collection.clips:
-        done = len(frames)
-
-        def report(part: float, *, done: int = done, rows: int = 0, **fields: object) -> None:
-            if progress:
-                progress((done + part * rows) / max(total, 1), **fields)
-
         rows = clip.indices("train")
-        frames += load_frames(
-            collection,
-            clip,
-            rows,
-            progress=lambda part, rows=len(rows), report=report, **fields: report(
-                part, rows=rows, **fields
-            ),
-        )
+        frames += load_frames(collection, clip, rows, progress=report)
     for index, name in enumerate(collection.appearances):
         if not any(f.appearance == index and f.rgba[..., 3].any() for f in frames):
             raise InputError(
@@ -46,20 +38,21 @@ def new_avatar(collection: Collection, frames: list[Frame], config: Config) -> A
     head = collection.head
     canonical = head.canonical(collection.betas)
     corner, size = hull_box(canonical, head.triangles, frames, config.reach)
-    occupied = np.stack(
-        [
-            carve(
-                canonical,
-                head.triangles,
-                [f for f in frames if f.appearance == index],
-                config.reach,
-                corner,
-                size,
-                config.occupancy_resolution,
-            )
-            for index in range(len(collection.appearances))
-        ]
-    )
+    cells = config.occupancy_resolution
+    coarse = -(-cells // 2)  # the hull is smooth: its cells may be twice as large
+    hulls = [
+        carve(
+            canonical,
+            head.triangles,
+            [f for f in frames if f.appearance == index],
+            config.reach,
+            corner,
+            size * 2 * coarse / cells,
+            coarse,
+        )
+        for index in range(len(collection.appearances))
+    ]
+    occupied = np.stack([_doubled(hull)[:cells, :cells, :cells] for hull in hulls])
     return Avatar.create(
         config,
         collection.appearances,
@@ -82,6 +75,13 @@ def new_avatar(collection: Collection, frames: list[Frame], config: Config) -> A
             }
         },
     )
+
+
+def _doubled(cells: np.ndarray) -> np.ndarray:
+    """Each cell cut into eight."""
+    for axis in range(3):
+        cells = cells.repeat(2, axis)
+    return cells
 
 
 def rigid_weights(regions: dict[str, np.ndarray], vertices: int) -> np.ndarray:

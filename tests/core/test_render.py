@@ -1,0 +1,146 @@
+import dataclasses
+
+import numpy as np
+import pytest
+
+from pav_blender.core.errors import Cancelled, InputError
+from pav_blender.core.evaluation.metrics import psnr
+from pav_blender.core.rendering.render import RenderSettings, render
+from pav_blender.core.training.frames import camera_of
+
+
+@pytest.fixture(scope="module")
+def pose(toy):
+    clip = toy.clip("plain")
+    vertices = toy.posed(clip, np.array([7]))[0]
+    return {"vertices": vertices, "camera": camera_of(clip, 7), "expression": clip.expression[7]}
+
+
+def picture(avatar, pose, appearance="plain", settings=None, **rest):
+    return render(avatar, appearance=appearance, settings=settings, **(pose | rest))
+
+
+def test_a_picture_has_a_head_before_nothing(toy_avatar, pose):
+    shown = picture(toy_avatar, pose)
+    assert shown.rgba.shape == (64, 64, 4)
+    assert shown.rgba.min() >= 0
+    assert shown.rgba.max() <= 1
+    assert shown.rgba[0, 0, 3] == 0
+    assert np.isinf(shown.depth[0, 0])
+    assert (shown.rgba[..., 3] > 0.9).mean() > 0.1
+    solid = shown.rgba[..., 3] > 0.9
+    assert 0.5 < np.median(shown.depth[solid]) < 0.9
+
+
+def test_depth_is_where_the_tracked_face_is(toy, toy_avatar, pose):
+    from pav_blender.core.rendering.rasterise import rasterise
+
+    shown = picture(toy_avatar, pose)
+    mesh, triangle, _ = rasterise(pose["vertices"], toy.head.triangles, pose["camera"])
+    face = toy.head.regions["face"][toy.head.triangles].all(1)
+    seen = (triangle >= 0) & face[triangle] & (shown.rgba[..., 3] > 0.95)
+    assert np.median(np.abs(shown.depth - mesh)[seen]) < 0.02
+
+
+def test_a_region_is_that_part_of_the_whole(toy_avatar, pose):
+    whole = picture(toy_avatar, pose)
+    part = picture(toy_avatar, pose, region=(10, 5, 50, 45))
+    np.testing.assert_array_equal(part.rgba, whole.rgba[5:45, 10:50])
+    np.testing.assert_array_equal(part.depth, whole.depth[5:45, 10:50])
+
+
+def test_skipping_empty_space_changes_next_to_nothing(toy_avatar, pose):
+    skipped = picture(toy_avatar, pose, settings=RenderSettings())
+    walked = picture(toy_avatar, pose, settings=RenderSettings(skip=False))
+    assert psnr(skipped.rgba, walked.rgba) > 50
+
+
+def test_ending_opaque_rays_changes_next_to_nothing(toy_avatar, pose):
+    ended = picture(toy_avatar, pose, settings=RenderSettings())
+    whole = picture(toy_avatar, pose, settings=RenderSettings(transmittance=0.0))
+    assert psnr(ended.rgba, whole.rgba) > 50
+
+
+def test_waves_and_chunks_do_not_show(toy_avatar, pose):
+    usual = picture(toy_avatar, pose)
+    other = picture(toy_avatar, pose, settings=RenderSettings(wave=3, chunk=1000))
+    assert np.abs(usual.rgba - other.rgba).max() < 2e-3
+
+
+def test_finer_steps_come_closer_to_the_dense_reference(toy_avatar, pose):
+    small = {"camera": pose["camera"].resized(32, 32)}
+    dense = picture(toy_avatar, pose | small, settings=RenderSettings(step=2.5e-4))
+    errors = [
+        psnr(picture(toy_avatar, pose | small, settings=RenderSettings(step=s)).rgba, dense.rgba)
+        for s in (4e-3, 2e-3, 1e-3)
+    ]
+    assert errors == sorted(errors)
+    assert errors[-1] > 35
+
+
+def test_the_same_input_gives_the_same_bits(toy_avatar, pose):
+    a, b = picture(toy_avatar, pose), picture(toy_avatar, pose)
+    np.testing.assert_array_equal(a.rgba, b.rgba)
+
+
+def test_blends_lie_between_their_appearances(toy_avatar, pose):
+    half = picture(toy_avatar, pose, {"plain": 1.0, "bushy": 1.0})
+    ends = [picture(toy_avatar, pose, name) for name in ("plain", "bushy")]
+    assert psnr(ends[0].rgba, ends[1].rgba) < 30
+    for end in ends:
+        assert psnr(half.rgba, end.rgba) < 60
+    alone = picture(toy_avatar, pose, {"bushy": 3.0})
+    np.testing.assert_allclose(alone.rgba, ends[1].rgba, atol=1e-5)
+
+
+def test_moving_everything_moves_nothing_in_the_picture(toy_avatar, pose):
+    """Head and camera turned and carried off together: the same picture."""
+    shown = picture(toy_avatar, pose)
+    angle = 0.7
+    turn = np.array(
+        [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+    )
+    shift = np.array([0.5, -0.2, 0.3])
+    to_world = np.eye(4)
+    to_world[:3, :3], to_world[:3, 3] = turn, shift
+    camera = pose["camera"]
+    moved = {
+        "vertices": (pose["vertices"] @ turn.T + shift).astype(np.float32),
+        "camera": dataclasses.replace(camera, camera_to_world=to_world @ camera.camera_to_world),
+    }
+    assert psnr(picture(toy_avatar, pose | moved).rgba, shown.rgba) > 40
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"vertices": np.zeros((3, 3))}, "3 vertices"),
+        ({"vertices": None}, "not finite"),
+        ({"expression": np.zeros(3)}, "expression"),
+        ({"appearance": "bald"}, "unknown appearance 'bald'"),
+        ({"appearance": {"plain": -1.0}}, "weights"),
+        ({"appearance": {}}, "weights"),
+    ],
+)
+def test_what_does_not_fit_is_told(toy_avatar, pose, change, words):
+    if "vertices" in change and change["vertices"] is None:
+        change = {"vertices": np.full_like(pose["vertices"], np.nan)}
+    with pytest.raises(InputError, match=words):
+        picture(toy_avatar, pose, **change)
+
+
+def test_rendering_can_be_stopped_and_watched(toy_avatar, pose):
+    seen = []
+    picture(toy_avatar, pose, settings=RenderSettings(chunk=1024), progress=seen.append)
+    assert seen == sorted(seen)
+    assert seen[-1] == 1
+    with pytest.raises(Cancelled):
+        picture(toy_avatar, pose, should_stop=lambda: True)
+
+
+def test_a_camera_that_sees_nothing_gives_an_empty_picture(toy_avatar, pose):
+    away = pose["camera"].camera_to_world.copy()
+    away[:3, :3] = away[:3, :3] @ np.diag([-1.0, 1, -1])
+    camera = dataclasses.replace(pose["camera"], camera_to_world=away)
+    shown = picture(toy_avatar, pose, camera=camera)
+    assert not shown.rgba.any()

@@ -1,0 +1,213 @@
+import dataclasses
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import torch
+
+from pav_blender.core.collection import read_collection
+from pav_blender.core.errors import Cancelled, InputError
+from pav_blender.core.evaluation.heldout import held_out, score
+from pav_blender.core.evaluation.report import figures, measure
+from pav_blender.core.field.avatar import Avatar
+from pav_blender.core.rendering.render import RenderSettings
+from pav_blender.core.training.batches import draw_pixels
+from pav_blender.core.training.checkpoint import checkpoint_path
+from pav_blender.core.training.losses import losses
+from pav_blender.core.training.prepare import load_training_frames, new_avatar
+from pav_blender.core.training.train import train
+from pav_blender.core.training.trainer import Trainer
+
+
+@pytest.fixture(scope="module")
+def frames(toy):
+    return load_training_frames(toy)
+
+
+def test_only_training_frames_are_read(frames, toy):
+    assert [f.name for f in frames if f.appearance == 0] == [f"plain/{i:06d}" for i in range(6)]
+    assert len(frames) == 12
+
+
+def test_depth_targets_are_the_tracked_face_and_nothing_else(frames, toy):
+    frame = frames[3]
+    target = frame.depth > 0
+    assert 50 < target.sum() < frame.depth.size / 3
+    pixels, depth = frame.camera.project(frame.vertices[toy.head.regions["face"]])
+    assert depth.min() - 0.01 < frame.depth[target].min()
+    rows = np.argwhere(target)
+    assert (rows.min(0) + 1 >= np.floor(pixels.min(0))[::-1]).all()
+    assert (rows.max(0) - 1 <= np.ceil(pixels.max(0))[::-1]).all()
+
+
+def test_the_hull_holds_the_surface_and_leaves_out_what_no_matte_shows(toy, frames, small_config):
+    """The second appearance's scalp stands out: its hull must hold it, the first's need not."""
+    avatar = new_avatar(toy, frames, small_config)
+    cells = small_config.occupancy_resolution
+
+    def filled(which, points):
+        at = ((points - avatar.box_min) / avatar.box_size * cells).astype(int)
+        inside = ((at >= 0) & (at < cells)).all(1)
+        return avatar.occupied[which][tuple(at[inside].T)].mean()
+
+    face = toy.head.canonical(toy.betas)[toy.head.regions["face"]]
+    assert filled(0, face) > 0.99
+    assert filled(1, face) > 0.99
+    assert filled(0, face + [0, 0, 0.06]) < 0.1
+    assert 0.02 < avatar.occupied[0].mean() < 0.4
+    assert avatar.occupied[1].sum() > avatar.occupied[0].sum()
+
+
+def test_batches_hold_what_the_pictures_hold(frames):
+    pixels = draw_pixels(frames[:3], 512, np.random.default_rng(0))
+    assert len(pixels.rays) == len(pixels.alpha) == len(pixels.frame)
+    index = 7
+    frame = frames[int(pixels.frame[index])]
+    points = frame.camera.origin + pixels.rays.directions[index : index + 1].numpy()
+    (x, y), _ = frame.camera.project(points)[0][0], None
+    expected = frame.rgba[int(y), int(x)] / 255
+    np.testing.assert_allclose(pixels.colour[index].numpy(), expected[:3], atol=1e-6)
+    np.testing.assert_allclose(float(pixels.alpha[index]), expected[3], atol=1e-6)
+
+
+def test_the_loss_is_zero_for_the_truth_and_weighs_as_the_paper_says(frames, small_config):
+    pixels = draw_pixels(frames[:3], 512, np.random.default_rng(0))
+    alpha = pixels.alpha[:, None]
+    background = torch.rand(len(alpha), 3)
+    distance = pixels.depth / pixels.rays.cosine
+    truth = (pixels.colour * alpha, pixels.alpha, distance)
+    assert float(losses(small_config, pixels, background, *truth).total) == pytest.approx(
+        0, abs=1e-6
+    )
+    off = losses(small_config, pixels, background, truth[0] + 0.1, *truth[1:])
+    assert float(off.total) == pytest.approx(50 * 0.01, rel=1e-3)
+    far = losses(small_config, pixels, background, *truth[:2], distance + 0.1 / pixels.rays.cosine)
+    face = float((pixels.depth > 0).float().mean())
+    assert face > 0.05
+    assert float(far.total) == pytest.approx(10 * 0.1 * face, rel=1e-3)
+
+
+def test_training_learns_the_person_and_tells_the_appearances_apart(toy, toy_avatar):
+    measured = measure(toy_avatar, toy, 2)
+    numbers = figures(measured)
+    assert numbers["psnr"]["head_mean"] > 18, numbers
+    for name, own in numbers["psnr"]["picture"].items():
+        assert own > max(numbers["switch_psnr"][name].values()) + 2, numbers
+    assert toy_avatar.record["iterations"] == 250
+
+
+def test_space_is_emptied_while_learning(toy, frames, toy_avatar, small_config):
+    before = new_avatar(toy, frames, small_config).occupied.mean()
+    assert toy_avatar.occupied.mean() < 0.8 * before
+
+
+def test_the_same_seed_gives_the_same_weights(toy, small_config, tmp_path):
+    config = dataclasses.replace(small_config, iterations=6)
+    states = []
+    for name in ("a", "b"):
+        avatar = train(toy, tmp_path / f"{name}.pav", config)
+        states.append(avatar.field.state_dict())
+    for key, value in states[0].items():
+        assert torch.equal(value, states[1][key]), key
+
+
+def test_a_stopped_training_goes_on_to_the_same_weights(toy, small_config, tmp_path):
+    config = dataclasses.replace(small_config, iterations=8)
+    whole = train(toy, tmp_path / "whole.pav", config)
+    calls = iter(range(100))
+    with pytest.raises(Cancelled, match="--resume"):
+        train(toy, tmp_path / "b.pav", config, should_stop=lambda: next(calls) == 3)
+    assert checkpoint_path(tmp_path / "b.pav").is_file()
+    assert not (tmp_path / "b.pav").exists()
+    resumed = train(toy, tmp_path / "b.pav", config, resume=True)
+    assert not checkpoint_path(tmp_path / "b.pav").exists()
+    for key, value in whole.field.state_dict().items():
+        torch.testing.assert_close(resumed.field.state_dict()[key], value, msg=key)
+
+
+def test_checkpoints_of_something_else_are_refused(toy, small_config, tmp_path):
+    config = dataclasses.replace(small_config, iterations=8)
+    with pytest.raises(Cancelled):
+        train(toy, tmp_path / "b.pav", config, should_stop=lambda: True)
+    other = dataclasses.replace(config, hidden=32)
+    with pytest.raises(InputError, match="other settings"):
+        train(toy, tmp_path / "b.pav", other, resume=True)
+    path = checkpoint_path(tmp_path / "b.pav")
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(InputError, match="damaged"):
+        train(toy, tmp_path / "b.pav", config, resume=True)
+
+
+def test_a_killed_training_leaves_no_avatar_and_a_signalled_one_a_checkpoint(toy_path, tmp_path):
+    command = [sys.executable, "-m", "pav_blender", "train", str(toy_path), "--json-progress"]
+    for kind, code in ((signal.SIGTERM, 1), (signal.SIGKILL, -9)):
+        out = tmp_path / f"{kind.name}.pav"
+        child = subprocess.Popen([*command, "--out", str(out)], stderr=subprocess.PIPE, text=True)
+        for line in child.stderr:
+            if '"train"' in line:
+                break
+        time.sleep(0.5)
+        child.send_signal(kind)
+        rest = child.stderr.read()
+        assert child.wait(timeout=60) == code
+        assert not out.exists()
+        if kind is signal.SIGTERM:
+            assert checkpoint_path(out).is_file()
+            assert "Traceback" not in rest
+    assert sorted(p.suffix for p in tmp_path.iterdir() if ".partial-" not in p.name) == [
+        ".checkpoint"
+    ]
+
+
+def test_an_appearance_without_pictures_is_told(toy_path, small_config, tmp_path):
+    copy = shutil.copytree(toy_path, tmp_path / "copy")
+    path = copy / "clips" / "bushy" / "frames.npz"
+    with np.load(path) as stored:
+        arrays = dict(stored)
+    arrays["split"] = np.full(8, "test")
+    np.savez(path, **arrays)
+    with pytest.raises(InputError, match="bushy"):
+        train(read_collection(copy), tmp_path / "a.pav", small_config)
+    assert not (tmp_path / "a.pav").exists()
+
+
+def test_bad_batches_do_not_harm(toy, frames, small_config):
+    """Frames without an opaque pixel, saturated or noisy ones: the weights stay finite."""
+    random = np.random.default_rng(0)
+    hostile = []
+    for which, frame in enumerate(frames[:3] + frames[-3:]):
+        rgba = [
+            np.zeros_like(frame.rgba),
+            np.full_like(frame.rgba, 255),
+            random.integers(0, 256, frame.rgba.shape, np.uint8),
+        ][which % 3]
+        hostile.append(dataclasses.replace(frame, rgba=rgba))
+    trainer = Trainer(new_avatar(toy, frames, small_config), hostile)
+    for _ in range(10):
+        trainer.iterate()
+    for name, value in trainer.avatar.field.state_dict().items():
+        assert torch.isfinite(value).all(), name
+
+
+def test_the_paper_preset_trains(toy, small_config, tmp_path):
+    from pav_blender.core.config import Config
+
+    small = {
+        name: getattr(small_config, name)
+        for name in ("log2_entries", "levels", "occupancy_resolution", "rays", "step")
+    }
+    config = dataclasses.replace(Config.paper(), iterations=5, **small)
+    avatar = train(toy, tmp_path / "a.pav", config)
+    assert Avatar.load(tmp_path / "a.pav").config.frames == "rigid"
+    assert np.isfinite(avatar.record["batch_psnr"])
+
+
+def test_scores_compare_with_the_frames_own_picture(toy, toy_avatar):
+    scores = held_out(toy_avatar, toy, per_appearance=1)
+    assert [s.appearance for s in scores] == toy.appearances
+    worn = score(toy_avatar, scores[0].frame, "bushy", RenderSettings())
+    assert worn.psnr < scores[0].psnr
