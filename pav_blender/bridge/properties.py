@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 import bpy
@@ -31,6 +32,17 @@ def appearance_items(self: Any, _context: Any) -> list[tuple[str, str, str, int]
             (name, name, f"Render the avatar as in {name}", avatars.number(name)) for name in names
         ]
     return _items[names]
+
+
+def clip_names(self: Any, _context: Any, edit_text: str) -> list[str]:
+    """Clips of the chosen collection whose name contains what was typed."""
+    try:
+        folder = avatars.resolve(self.collection)
+        known = json.loads((folder / "collection.json").read_text(encoding="utf-8"))["clips"]
+        names = [str(clip["name"]) for clip in known]
+    except (PavError, OSError, ValueError, KeyError, TypeError):
+        return []
+    return [name for name in names if edit_text.lower() in name.lower()]
 
 
 def _avatar_chosen(self: Any, context: Any) -> None:
@@ -63,6 +75,10 @@ class PavObject(bpy.types.PropertyGroup):
         update=_redraw,
     )
 
+    camera: bpy.props.PointerProperty(  # type: ignore[valid-type]
+        name="Camera", description="The camera of the imported track", type=bpy.types.Object
+    )
+
 
 class PavScene(bpy.types.PropertyGroup):
     """Settings of rendering and of the jobs started from the panels."""
@@ -76,7 +92,9 @@ class PavScene(bpy.types.PropertyGroup):
         subtype="DIR_PATH",
     )
     clip: bpy.props.StringProperty(  # type: ignore[valid-type]
-        name="Clip", description="Clip of the collection whose track to import"
+        name="Clip",
+        description="Clip of the collection whose track to import; its first if empty",
+        search=clip_names,
     )
     output: bpy.props.StringProperty(  # type: ignore[valid-type]
         name="Avatar",

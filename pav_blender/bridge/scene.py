@@ -37,6 +37,8 @@ def build_head(avatar_path: Path, appearance: str | None = None) -> Any:
     from .rig import build_rig
 
     avatar = avatars.load(avatar_path)
+    name = avatar.appearances[0] if appearance is None else appearance
+    avatar.appearance_index(name)  # a wrong name is told before anything is built
     head = load_head(avatar.head_name)
     if head.fingerprint != avatar.head_fingerprint:
         raise InputError(
@@ -45,16 +47,8 @@ def build_head(avatar_path: Path, appearance: str | None = None) -> Any:
         )
     rig = build_rig(head, avatar.betas, avatar_path.stem, bpy.context.scene.collection)
     rig.mesh.pav.avatar = stored_path(avatar_path, bpy.data.filepath)
-    choose_appearance(rig.mesh, avatar.appearances, appearance)
+    rig.mesh.pav.appearance = name
     return rig
-
-
-def choose_appearance(mesh: Any, known: list[str], name: str | None) -> None:
-    """Sets the appearance of a head object; the avatar's first for None."""
-    name = name or known[0]
-    if name not in known:
-        raise InputError(f"unknown appearance {name!r}; the avatar has {', '.join(known)}")
-    mesh.pav.appearance = name
 
 
 def stored_path(path: Path, blend: str) -> str:
@@ -73,8 +67,8 @@ def stored_path(path: Path, blend: str) -> str:
 
 
 def import_track(mesh: Any, collection: Any, clip_name: str, fps: float | None = None) -> Any:
-    """Animates a head object and the scene's camera as in a clip of a `Collection`; returns the
-    camera object.
+    """Animates a head object, and a camera of its own, as in a clip of a `Collection`; returns
+    the camera, now the scene's.
 
     The scene's frame numbers are the clip's own (`frame_id`); frames of held-out cameras are left
     out; between frames everything is linear. Sets the scene's range, size and, if given, rate.
@@ -101,7 +95,7 @@ def import_track(mesh: Any, collection: Any, clip_name: str, fps: float | None =
     motion = Motion(clip.expression[rows], clip.pose[rows], clip.translation[rows], frames)
     apply_motion(mesh, armature, head.expression_names, head.joint_names, motion)
     lenses = [from_intrinsics(k, clip.width, clip.height) for k in clip.intrinsics[rows]]
-    camera = scene.camera or _new_camera(scene)
+    camera = _track_camera(scene, mesh)
     camera.data.type, camera.data.sensor_fit = "PERSP", lenses[0].sensor_fit
     camera.data.sensor_width = lenses[0].sensor_width
     apply_camera(camera, frames, clip.camera_to_world[rows], lenses)
@@ -161,12 +155,17 @@ def _rows(clip: Any) -> np.ndarray:
     return rows[np.argsort(clip.frame_id[rows], kind="stable")]
 
 
-def _new_camera(scene: Any) -> Any:
+def _track_camera(scene: Any, mesh: Any) -> Any:
+    """The head's own camera, made when it has none: the user's cameras stay as they are."""
     import bpy
 
-    camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
-    camera.data.clip_start = 0.01
-    scene.collection.objects.link(camera)
+    camera = mesh.pav.camera
+    if camera is None or camera.name not in scene.objects:
+        name = f"{mesh.name} camera"
+        camera = bpy.data.objects.new(name, bpy.data.cameras.new(name))
+        camera.data.clip_start = 0.01
+        scene.collection.objects.link(camera)
+        mesh.pav.camera = camera
     scene.camera = camera
     return camera
 
@@ -206,6 +205,7 @@ def run(args: argparse.Namespace) -> int:
             args.avatar, collection, clip.name, appearance=args.appearance, fps=args.fps
         )
         made.mesh.pav.avatar = stored_path(args.avatar, str(args.out))
+        _scene().render.filepath = f"//{args.out.stem}/"
         save_copy(args.out)
     print(f"{args.out}: clip {clip.name}, {len(clip)} frames")
     return 0
@@ -221,6 +221,12 @@ def save_copy(path: Path) -> None:
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _scene() -> Any:
+    import bpy
+
+    return bpy.context.scene
 
 
 class _blender:
