@@ -10,7 +10,6 @@ from numba import njit
 from torch import Tensor
 
 from ...errors import InputError
-from .threads import run_chunks, threads
 from ..reference.encoding import (
     FEATURES,
     Layout,
@@ -20,6 +19,8 @@ from ..reference.encoding import (
     resolutions,
     table_sizes,
 )
+from .corners import BLOCK, STRIDE, add_corners, locate_block, read_corners
+from .threads import run_chunks, threads
 
 __all__ = [
     "Layout",
@@ -33,15 +34,16 @@ __all__ = [
     "table_sizes",
 ]
 
-BLOCK = 512  # samples whose corners and weights are worked out together: 32 KiB
-PRIME_Y = np.uint32(2654435761)
-PRIME_Z = np.uint32(805459861)
 # Not "nnan" or "ninf": points may be anything.
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 
 
 def encode(points: Tensor, tables: Tensor, layout: Layout) -> Tensor:
-    """As the reference, in float32; the gradient goes to the tables only."""
+    """As the reference, in float32; the gradient goes to the tables only.
+
+    The result [N, levels * 2] lies in memory feature by feature (its strides are 1 and N): levels
+    are worked on one at a time, so that a level's table stays in the cache. `mlp` takes it so.
+    """
     check_encode(points, tables, layout)
     if points.requires_grad:
         raise InputError("encode: the CPU kernel has no gradient for points; use the reference")
@@ -55,32 +57,32 @@ def encode_backward_into(
     check_encode(points, grad_tables, layout)
     # A level belongs to one thread, so that no two add to one entry and sums have one order.
     run_chunks(
-        _encode_backward_levels,
+        _backward_levels,
         layout.levels,
-        1,
+        _levels_at_once(len(points), layout),
         _array(points),
-        _array(grad_out),
-        _array(grad_tables, in_place=True),
-        *_layout_arrays(layout),
+        _array(grad_out.t()).reshape(-1),
+        _array(grad_tables, in_place=True).reshape(-1),
+        _level_array(layout),
     )
 
 
 class _Encode(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, points: Tensor, tables: Tensor, layout: Layout) -> Tensor:
-        out = torch.empty(len(points), layout.width)
+        out = torch.empty(layout.width, len(points))
         run_chunks(
-            _encode_samples,
-            len(points),
-            BLOCK * 8,
+            _encode_levels,
+            layout.levels,
+            _levels_at_once(len(points), layout),
             _array(points),
-            _array(tables),
-            out.numpy(),
-            *_layout_arrays(layout),
+            _array(tables).reshape(-1),
+            out.view(-1).numpy(),
+            _level_array(layout),
         )
         ctx.save_for_backward(points)
         ctx.layout = layout
-        return out
+        return out.t()
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[None, Tensor, None]:
@@ -90,127 +92,64 @@ class _Encode(torch.autograd.Function):
         return None, grad_tables, None
 
 
-def _layout_arrays(layout: Layout) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Resolution, first entry, and hash mask of every level (0 where the level is dense)."""
+def _level_array(layout: Layout) -> np.ndarray:
+    """Resolution, first entry and hash mask (0 where dense) of every level, the finest first:
+
+    the levels that take longest begin first, and the short ones fill the gap at the end.
+    """
     masks = [size - 1 if h else 0 for size, h in zip(layout.sizes, layout.hashed, strict=True)]
-    return (
-        np.array(layout.resolutions, np.int64),
-        np.array(layout.offsets, np.int64),
-        np.array(masks, np.int64),
-    )
+    rows = [*zip(layout.resolutions, layout.offsets, masks, range(layout.levels), strict=True)]
+    return np.array(rows[::-1], np.int64)
+
+
+def _levels_at_once(count: int, layout: Layout) -> int:
+    """Few samples are not worth handing out a level at a time."""
+    share = -(-layout.levels // (2 * threads()))
+    return max(1, min(share, 8192 // max(count, 1)))
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
 def _transpose_points(points, start, count, unit):
-    """Points start to start + count as rows of unit [3, BLOCK], clamped; not a number becomes 0."""
+    """Points start to start + count as three rows of unit, clamped; not a number becomes 0."""
     for i in range(count):
         for axis in range(3):
             p = points[start + i, axis]
             p = p if p > 0 else np.float32(0)
-            unit[axis, i] = p if p < 1 else np.float32(1)
+            unit[axis * BLOCK + i] = p if p < 1 else np.float32(1)
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
-def _locate(unit, count, res, mask, index, weight):
-    """Table entry (within the level) and weight of the 8 corners round every point."""
-    scale = np.float32(res)
-    last = np.int32(res - 1)
-    row = np.int32(res + 1)
-    for i in range(count):
-        px = unit[0, i] * scale
-        py = unit[1, i] * scale
-        pz = unit[2, i] * scale
-        x = min(np.int32(px), last)
-        y = min(np.int32(py), last)
-        z = min(np.int32(pz), last)
-        fx = px - np.float32(x)
-        fy = py - np.float32(y)
-        fz = pz - np.float32(z)
-        gx = np.float32(1) - fx
-        gy = np.float32(1) - fy
-        gz = np.float32(1) - fz
-        weight[0, i] = gx * gy * gz
-        weight[1, i] = fx * gy * gz
-        weight[2, i] = gx * fy * gz
-        weight[3, i] = fx * fy * gz
-        weight[4, i] = gx * gy * fz
-        weight[5, i] = fx * gy * fz
-        weight[6, i] = gx * fy * fz
-        weight[7, i] = fx * fy * fz
-        if mask == 0:
-            index[0, i] = np.int32(x + row * np.int32(y + row * z))
-        else:
-            # Remembered for the second loop, which turns them into the eight hashes.
-            index[0, i] = x
-            index[1, i] = y
-            index[2, i] = z
-    if mask == 0:
-        for i in range(count):
-            first = index[0, i]
-            for corner in range(1, 8):
-                step = (corner & 1) + row * ((corner >> 1 & 1) + row * (corner >> 2))
-                index[corner, i] = np.int32(first + step)
-    else:
-        bits = np.uint32(mask)
-        for i in range(count):
-            x0 = np.uint32(index[0, i])
-            y0 = np.uint32(np.uint32(index[1, i]) * PRIME_Y)
-            z0 = np.uint32(np.uint32(index[2, i]) * PRIME_Z)
-            x1 = np.uint32(x0 + np.uint32(1))
-            y1 = np.uint32(y0 + PRIME_Y)
-            z1 = np.uint32(z0 + PRIME_Z)
-            index[0, i] = np.int32((x0 ^ y0 ^ z0) & bits)
-            index[1, i] = np.int32((x1 ^ y0 ^ z0) & bits)
-            index[2, i] = np.int32((x0 ^ y1 ^ z0) & bits)
-            index[3, i] = np.int32((x1 ^ y1 ^ z0) & bits)
-            index[4, i] = np.int32((x0 ^ y0 ^ z1) & bits)
-            index[5, i] = np.int32((x1 ^ y0 ^ z1) & bits)
-            index[6, i] = np.int32((x0 ^ y1 ^ z1) & bits)
-            index[7, i] = np.int32((x1 ^ y1 ^ z1) & bits)
-
-
-@njit(cache=True, nogil=True, fastmath=FAST)
-def _encode_samples(start, stop, points, tables, out, grids, offsets, masks):
-    unit = np.empty((3, BLOCK), np.float32)
-    index = np.empty((8, BLOCK), np.int32)
-    weight = np.empty((8, BLOCK), np.float32)
-    for begin in range(start, stop, BLOCK):
-        count = min(BLOCK, stop - begin)
-        _transpose_points(points, begin, count, unit)
-        for level in range(len(grids)):
-            _locate(unit, count, grids[level], masks[level], index, weight)
-            table = tables[offsets[level] :]
-            for i in range(count):
-                a = np.float32(0)
-                b = np.float32(0)
-                for corner in range(8):
-                    w = weight[corner, i]
-                    entry = index[corner, i]
-                    a += w * table[entry, 0]
-                    b += w * table[entry, 1]
-                out[begin + i, 2 * level] = a
-                out[begin + i, 2 * level + 1] = b
-
-
-@njit(cache=True, nogil=True, fastmath=FAST)
-def _encode_backward_levels(first, end, points, grad_out, grad_tables, grids, offsets, masks):
-    unit = np.empty((3, BLOCK), np.float32)
-    index = np.empty((8, BLOCK), np.int32)
-    weight = np.empty((8, BLOCK), np.float32)
-    for level in range(first, end):
-        table = grad_tables[offsets[level] :]
-        for begin in range(0, len(points), BLOCK):
-            count = min(BLOCK, len(points) - begin)
+@njit(cache=True, nogil=True)
+def _encode_levels(first, end, points, table, out, levels):
+    unit = np.zeros(3 * BLOCK, np.float32)
+    index = np.zeros(8 * STRIDE, np.int32)
+    weight = np.zeros(8 * STRIDE, np.float32)
+    total = len(points)
+    for k in range(first, end):
+        res, entry, mask, level = levels[k]
+        for begin in range(0, total, BLOCK):
+            count = min(BLOCK, total - begin)
             _transpose_points(points, begin, count, unit)
-            _locate(unit, count, grids[level], masks[level], index, weight)
+            locate_block(unit, count, res, entry, mask, table, index, weight)
+            at = 2 * level * total + begin
             for i in range(count):
-                a = grad_out[begin + i, 2 * level]
-                b = grad_out[begin + i, 2 * level + 1]
-                for corner in range(8):
-                    w = weight[corner, i]
-                    entry = index[corner, i]
-                    table[entry, 0] += w * a
-                    table[entry, 1] += w * b
+                read_corners(table, index, weight, i, out, at + i, at + total + i)
+
+
+@njit(cache=True, nogil=True)
+def _backward_levels(first, end, points, grad_out, grad_table, levels):
+    unit = np.zeros(3 * BLOCK, np.float32)
+    index = np.zeros(8 * STRIDE, np.int32)
+    weight = np.zeros(8 * STRIDE, np.float32)
+    total = len(points)
+    for k in range(first, end):
+        res, entry, mask, level = levels[k]
+        for begin in range(0, total, BLOCK):
+            count = min(BLOCK, total - begin)
+            _transpose_points(points, begin, count, unit)
+            locate_block(unit, count, res, entry, mask, grad_table, index, weight)
+            at = 2 * level * total + begin
+            for i in range(count):
+                add_corners(grad_table, index, weight, i, grad_out, at + i, at + total + i)
 
 
 def read_texture(latent: Tensor, appearance: Tensor, uv: Tensor) -> Tensor:

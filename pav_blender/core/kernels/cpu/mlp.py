@@ -2,7 +2,7 @@
 
 Blocks of samples go through all layers while they lie in the first cache. Rows stay rows: a layer
 is `init + x @ W^T` for a few dozen samples at a time, and its two gradients are products of the
-same kind, so one routine (`simd.multiply`) does everything.
+same kind, so one routine (`tiles.multiply`) does everything.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from numba import njit
 from torch import Tensor
 
 from ...errors import InputError
-from .simd import LANES, MASKED, PLAIN, RELU, ROWS, multiply
-from .threads import run_chunks
 from ..reference import mlp as reference
+from .threads import run_chunks
+from .tiles import LANES, MASKED, PLAIN, RELU, ROWS, multiply
 
 BLOCK = 8 * ROWS  # samples that go through the layers together
 CHUNK = 16 * BLOCK  # samples handed to a thread at a time
@@ -125,7 +125,7 @@ class _Mlp(torch.autograd.Function):
 
 @dataclass(frozen=True)
 class _Net:
-    """Weights laid out for `simd.multiply`: padded, both ways round, in one array."""
+    """Weights laid out for `tiles.multiply`: padded, both ways round, in one array."""
 
     packed: np.ndarray
     plan: np.ndarray  # [layers, 10]

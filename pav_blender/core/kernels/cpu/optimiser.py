@@ -9,8 +9,8 @@ from numba import njit
 from torch import Tensor
 
 from ...errors import InputError
-from .threads import run_chunks
 from ..reference.optimiser import check_adam, touched_rows
+from .threads import run_chunks
 
 CHUNK = 1 << 16
 

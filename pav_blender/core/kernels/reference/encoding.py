@@ -33,7 +33,7 @@ def resolutions(levels: int, base: int, finest: int) -> list[int]:
 
 
 def table_sizes(levels: int, log2_entries: int, resolutions: list[int]) -> list[int]:
-    """Entries of every level: (res + 1)^3, rounded up to 8, where that fits, else 2^log2_entries."""
+    """Entries of every level: (res + 1)^3, rounded up to 8, if that fits, else 2^log2_entries."""
     if len(resolutions) != levels:
         raise InputError(f"hash encoding: {levels} levels but {len(resolutions)} resolutions")
     if not 3 <= log2_entries <= 26:
@@ -80,7 +80,8 @@ class Layout:
 def encode(points: Tensor, tables: Tensor, layout: Layout) -> Tensor:
     """Encode points [N,3] with tables [layout.entries, 2] -> [N, levels * 2].
 
-    Differentiable in both.     Points are clamped into the unit cube; a coordinate that is not a number counts as 0.
+    Points are clamped into the unit cube; a coordinate that is not a number counts as 0.
+    Differentiable in points and tables.
     """
     check_encode(points, tables, layout)
     points = torch.nan_to_num(points, nan=0.0).clamp(0, 1)
