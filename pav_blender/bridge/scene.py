@@ -38,7 +38,7 @@ def build_head(avatar_path: Path, appearance: str | None = None) -> Any:
 
     avatar = avatars.load(avatar_path)
     name = avatar.appearances[0] if appearance is None else appearance
-    avatar.appearance_index(name)  # a wrong name is told before anything is built
+    check_appearance(avatar.appearances, name)  # told before anything is built
     head = load_head(avatar.head_name)
     if head.fingerprint != avatar.head_fingerprint:
         raise InputError(
@@ -47,8 +47,20 @@ def build_head(avatar_path: Path, appearance: str | None = None) -> Any:
         )
     rig = build_rig(head, avatar.betas, avatar_path.stem, bpy.context.scene.collection)
     rig.mesh.pav.avatar = stored_path(avatar_path, bpy.data.filepath)
-    rig.mesh.pav.appearance = name
+    choose_appearance(rig.mesh, avatar.appearances, name)
     return rig
+
+
+def check_appearance(known: list[str], name: str) -> None:
+    """InputError naming the appearances there are, unless `name` is one."""
+    if name not in known:
+        raise InputError(f"unknown appearance {name!r}; the avatar has {', '.join(known)}")
+
+
+def choose_appearance(mesh: Any, known: list[str], name: str) -> None:
+    """Sets the appearance of a head object whose avatar has the appearances `known`."""
+    check_appearance(known, name)
+    mesh.pav.appearance = name
 
 
 def stored_path(path: Path, blend: str) -> str:
