@@ -1,7 +1,7 @@
 """Builds the Blender extension and validates it: `python tools/build_extension.py`.
 
 Uses Blender's own packer: from the bpy wheel if this Python has one, else from a Blender binary
-(`--blender PATH`, or $BLENDER). The archive lands in out/ under its final name only when it is
+(`--blender COMMAND`, or $BLENDER). The archive lands in out/ under its final name only when it is
 valid.
 """
 
@@ -22,11 +22,13 @@ SOURCE = ROOT / "pav_blender"
 
 def packer(blender: str | None) -> list[str]:
     """The command that runs Blender's extension tool."""
+    spec = importlib.util.find_spec("bpy")
+    if blender is None and spec is None:
+        blender = os.environ.get("BLENDER")
     if blender:
         return [*shlex.split(blender), "--command", "extension"]
-    spec = importlib.util.find_spec("bpy")
     if spec is None or spec.origin is None:
-        raise SystemExit("no bpy in this Python: pip install bpy, or pass --blender PATH")
+        raise SystemExit("no bpy in this Python: pip install bpy, or pass --blender COMMAND")
     found = sorted(Path(spec.origin).parent.glob("*/scripts/addons_core/bl_pkg/cli/blender_ext.py"))
     if not found:
         raise SystemExit(f"{Path(spec.origin).parent}: no blender_ext.py in this bpy")
@@ -42,8 +44,8 @@ def build(out: Path, blender: str | None = None, source: Path = SOURCE) -> Path:
     command = packer(blender)
     try:
         for arguments in (
-            ["build", "--source-dir", str(source), "--output-filepath", str(temporary)],
-            ["validate", str(temporary)],
+            ["build", "--source-dir", _here(source), "--output-filepath", _here(temporary)],
+            ["validate", _here(temporary)],
         ):
             done = subprocess.run([*command, *arguments], capture_output=True, text=True)
             if done.returncode != 0:
@@ -54,10 +56,15 @@ def build(out: Path, blender: str | None = None, source: Path = SOURCE) -> Path:
     return archive
 
 
+def _here(path: Path) -> str:
+    """Relative to the working folder: a wrapper may run Blender where that has another path."""
+    return os.path.relpath(path)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=ROOT / "out")
-    parser.add_argument("--blender", default=os.environ.get("BLENDER"))
+    parser.add_argument("--blender", help="command of a Blender to build with")
     args = parser.parse_args()
     archive = build(args.out, args.blender)
     print(f"{archive} ({archive.stat().st_size / 1e6:.1f} MB)")
