@@ -1,4 +1,4 @@
-"""The synthetic person: bpy and Cycles film a head in several appearances and write a collection."""
+"""The synthetic person: Cycles films a head in several appearances and writes a collection."""
 
 from __future__ import annotations
 

@@ -32,11 +32,12 @@ def glasses(person: Person, colour, label: int, round_rims: bool = False) -> lis
         start = rim[np.argmax(shape_x + 0.8 * shape_y)]
         bend = ear + np.array([0.001, -0.004, -0.012])
         tip = ear + np.array([-0.004, -0.030, -0.022])
-        temple = bezier(np.array([start, hinge, 0.5 * (hinge + ear) + [0.003, 0, 0], ear, bend, tip]))
+        half_way = 0.5 * (hinge + ear) + np.array([0.003, 0, 0])
+        temple = bezier(np.array([start, hinge, half_way, ear, bend, tip]))
         pieces.append(sweep(temple * mirror, 0.0013, 8, flatten=1.6))
         pad = np.array([0.0085, eye[1] - 0.008, bridge[2] - 0.006])
         wire = bezier(np.array([[centre[0] - half_width + 0.002, eye[1] - 0.006, centre[2]],
-                                pad + [0.003, 0.001, -0.004], pad]))  # fmt: skip
+                                pad + np.array([0.003, 0.001, -0.004]), pad]))  # fmt: skip
         pieces.append(sweep(wire * mirror, 0.0006, 6))
     inner = centre[0] - half_width + 0.001
     span = np.linspace(-1, 1, 16)
@@ -45,7 +46,7 @@ def glasses(person: Person, colour, label: int, round_rims: bool = False) -> lis
     pieces.append(sweep(nose, 0.00125, 8))
     frame, graph = new_material("studio frame")
     graph.principled(Base_Color=colour, Roughness=0.25, Metallic=0.2, Coat_Weight=0.5)
-    return [mesh_object("studio glasses", *join(*pieces), frame, label=label)]
+    return [_worn("studio glasses", join(*pieces), frame, label)]
 
 
 def bezier(points: np.ndarray, count: int = 40) -> np.ndarray:
@@ -70,7 +71,7 @@ def earrings(person: Person, label: int, radius: float = 0.0075) -> list:
     pieces = [sweep((lobe + hoop) * [side, 1, 1], 0.0010, 8, closed=True) for side in (-1, 1)]
     gold, graph = new_material("studio gold")
     graph.principled(Base_Color=(0.83, 0.58, 0.2), Metallic=1.0, Roughness=0.2)
-    return [mesh_object("studio earrings", *join(*pieces), gold, label=label)]
+    return [_worn("studio earrings", join(*pieces), gold, label)]
 
 
 def beanie(person: Person, colour, label: int) -> list:
@@ -89,7 +90,8 @@ def beanie(person: Person, colour, label: int) -> list:
     levels = np.concatenate([np.linspace(0, 0.25, 8), np.linspace(0.3, 1.0, 22)])
     for level in levels:
         toward = np.stack([np.sin(azimuth), 0 * azimuth, np.cos(azimuth)], 1)
-        rim = 0.5 * (front_height + back_height) + 0.5 * (front_height - back_height) * np.cos(azimuth)
+        tilt = 0.5 * (front_height - back_height)
+        rim = 0.5 * (front_height + back_height) + tilt * np.cos(azimuth)
         low = np.arctan2(rim - centre[1], 0.088)
         elevation = low + (np.pi / 2 - low) * level
         ray = toward * np.cos(elevation)[:, None] + np.array([0, 1, 0]) * np.sin(elevation)[:, None]
@@ -99,7 +101,6 @@ def beanie(person: Person, colour, label: int) -> list:
         cuff = 0.006 * (level < 0.26)
         ridge = 0.0009 * np.sin(60 * azimuth) * (1 - level)
         rows.append(centre + ray * (radius + 0.0065 + cuff + slouch + ridge)[:, None])
-    inner = rows[0] + 0.0 * rows[0]
     inner = centre + (rows[0] - centre) * 0.95
     mesh = grid(np.stack([inner, *rows], axis=1).transpose(1, 0, 2), closed_columns=True)
     wool, graph = new_material("studio wool")
@@ -108,4 +109,8 @@ def beanie(person: Person, colour, label: int) -> list:
     shade = graph.add("MapRange", _0=graph.noise(rest, 260.0), _1=0.3, _2=0.7, _3=0.7, _4=1.2)
     base = graph.mix(1.0, colour, shade.outputs[0], "MULTIPLY")
     graph.principled(Base_Color=base, Roughness=0.95, Normal=bump, Sheen_Weight=0.4)
-    return [mesh_object("studio hat", *mesh, wool, label=label, rest=mesh[0])]
+    return [_worn("studio hat", mesh, wool, label)]
+
+
+def _worn(name: str, mesh: tuple[np.ndarray, np.ndarray], material, label: int):
+    return mesh_object(name, mesh[0], mesh[1], material, label=label, rest=mesh[0])

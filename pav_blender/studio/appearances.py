@@ -69,7 +69,7 @@ APPEARANCES = (
             (
                 AreaLight(52, 24, 34, 0.45, colour=(1.0, 0.80, 0.58)),
                 AreaLight(-60, 10, 7, 0.9, colour=(0.66, 0.80, 1.0)),
-                AreaLight(-150, 30, 15, 0.5, colour=(0.80, 0.88, 1.0)),
+                AreaLight(-150, 18, 13, 0.5, colour=(0.80, 0.88, 1.0)),
             ),
             zenith=(0.34, 0.30, 0.28), ground=(0.12, 0.08, 0.06), sky=0.55,
         ),
@@ -127,7 +127,7 @@ APPEARANCES = (
         ),
         Outfit("roll", (0.42, 0.36, 0.27), None, "knit", 1.2, 13),
         COPPER,
-        ScalpStyle("long", COPPER, 5600, 14, 0.00034, 0.17, 22, 0.55, wave=0.006),
+        ScalpStyle("long", COPPER, 13000, 14, 0.00034, 0.17, 22, 0.55, wave=0.006),
         glasses=(0.30, 0.20, 0.10),
         round_glasses=True,
         hat=(0.03, 0.11, 0.115),
@@ -149,7 +149,7 @@ class RigidActor:
 
 @dataclass(eq=False)
 class HangingHair:
-    """Long hair: rides on the head near its roots, on the torso further down, and lies on the torso."""
+    """Long hair: follows the head near its roots, the torso further down, and lies on it."""
 
     items: list
     rest: np.ndarray  # [S,P,3]
@@ -257,7 +257,7 @@ def _add_facial(studio: StudioScene, person: Person, look: Appearance, surface, 
     studio.add(facial.ride(person, "studio brows", strands, roots, hair.taper(0.00016, 4),
                            brow_material, label, tint))  # fmt: skip
     roots, strands = facial.lash_strands(person, 230, rng)
-    dark = np.tile(np.float32([0.012, 0.009, 0.008]), (len(strands), 1))
+    dark = np.tile(np.array([0.012, 0.009, 0.008], np.float32), (len(strands), 1))
     studio.add(facial.ride(person, "studio lashes", strands, roots, hair.taper(0.00013, 4),
                            brow_material, label, dark))  # fmt: skip
     if look.beard:

@@ -1,4 +1,4 @@
-"""Clothes: the torso smoothed, pushed out and folded; collars, ribs and hoods lofted round the neck."""
+"""Clothes: the torso smoothed, pushed out and folded; collars and hoods lofted round the neck."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def garment(person: Person, outfit: Outfit):
     step = np.zeros(len(cloth))
     if outfit.over is not None:
         step = smoothstep(layer_edge(cloth, centre), -0.004, 0.004)
-    out = 0.007 + 0.007 * step + 0.0035 * outfit.folds * folds(cloth, outfit.seed, centre)
+    out = 0.007 + 0.007 * step + 0.0030 * outfit.folds * folds(cloth, outfit.seed, centre)
     # the shoulders drape: cloth bridges the hollows over the collar bones
     return cloth + out[:, None] * normals, faces
 
@@ -87,8 +87,8 @@ def folds(points: np.ndarray, seed: int, centre: np.ndarray) -> np.ndarray:
         origin = centre + np.array([rng.uniform(-0.25, 0.25), rng.uniform(-0.25, 0.02), 0.0])
         offset = points - origin
         angle = np.arctan2(offset[:, 0], -offset[:, 1] + 0.15)
-        wave = np.sin(rng.uniform(9, 20) * angle + rng.uniform(0, 6.3)
-                      + 8 * np.sin(11 * points[:, 1] + rng.uniform(0, 6.3)))  # fmt: skip
+        wave = np.sin(rng.uniform(6, 13) * angle + rng.uniform(0, 6.3)
+                      + 2.5 * np.sin(9 * points[:, 1] + rng.uniform(0, 6.3)))  # fmt: skip
         reach = np.exp(-0.5 * (np.linalg.norm(offset, axis=1) / rng.uniform(0.06, 0.14)) ** 2)
         out += reach * np.sign(wave) * np.abs(wave) ** 1.4
     return np.clip(out, -1.6, 1.6)
@@ -121,11 +121,12 @@ def collar(person: Person):
     up = np.array([0.0, 1.0, 0.0])
     # (out, up) in metres along the section: stand, fold, fall
     section = ((0.008, -0.012), (0.007, 0.004), (0.006, 0.020), (0.0075, 0.0285), (0.0115, 0.031),
-               (0.0150, 0.028), (0.0180, 0.016), (0.0220, 0.000), (0.0260, -0.012))  # fmt: skip
+               (0.0160, 0.028), (0.0205, 0.016), (0.0255, 0.000), (0.0300, -0.011))  # fmt: skip
     rows = []
     for number, (out, rise) in enumerate(section):
         fall = max(number - 4, 0) / 4
-        shift = outward * (out + 0.010 * fall * front) + up * (rise - 0.005 * front - 0.026 * fall * front)
+        lower = 0.005 * front + 0.026 * fall * front
+        shift = outward * (out + 0.010 * fall * front) + up * (rise - lower)
         aside = np.stack([np.sin(theta), 0 * theta, 0 * theta], 1) * 0.010 * fall * front
         rows.append(path + shift + aside)
     return grid(np.stack(rows, axis=1))
@@ -204,12 +205,19 @@ def outfit_objects(person: Person, outfit: Outfit, label: int) -> list:
     main = cloth_material(outfit, outfit.colour, centre, True)
     vertices, quads = garment(person, outfit)
     items = [
-        mesh_object("studio garment", vertices, quads, main, label=label, rest=vertices,
-                    layer=layer_edge(vertices, centre))  # fmt: skip
+        mesh_object(
+            "studio garment",
+            vertices,
+            quads,
+            main,
+            label=label,
+            rest=vertices,
+            layer=layer_edge(vertices, centre),
+        )
     ]
 
     def piece(name: str, mesh, material=plain) -> None:
-        items.append(mesh_object(name, *mesh, material, label=label, rest=mesh[0]))
+        items.append(mesh_object(name, mesh[0], mesh[1], material, label=label, rest=mesh[0]))
 
     if outfit.neck == "collar":
         piece("studio collar", collar(person))

@@ -76,7 +76,7 @@ def tooth_material(person: Person, name: str):
     tooth = graph.mix(gap, (0.74, 0.68, 0.57), (0.32, 0.24, 0.17))
     graph.principled(
         Base_Color=graph.mix(gum, tooth, (0.44, 0.13, 0.12)), Roughness=0.18, Coat_Weight=0.3,
-        Emission_Color=graph.mix(gum, tooth, (0.44, 0.13, 0.12)), Emission_Strength=0.10,
+        Emission_Color=graph.mix(gum, tooth, (0.44, 0.13, 0.12)), Emission_Strength=0.06,
     )  # fmt: skip
     return material
 

@@ -109,11 +109,11 @@ def beard_mask(person: Person, kind: str):
             (ear[1] + 0.012, ear[1] + 0.005, mouth[1] + 0.012, mouth[1] + 0.008,
              mouth[1] + 0.016, nose[1] - 0.009),
         )  # fmt: skip
-        cheek = 1 - smoothstep(y, height - 0.005, height + 0.003)
+        cheek = 1 - smoothstep(y - height, -0.005, 0.003)
         # lower edge: along the jaw, a little onto the neck
         under = chin[1] - 0.004 + 0.45 * (chin[2] - z)
         under = np.minimum(under, ear[1] - 0.012) - 0.016
-        neck = smoothstep(y, under - 0.004, under + 0.008)
+        neck = smoothstep(y - under, -0.004, 0.008)
         front = smoothstep(z, ear[2] + 0.008, ear[2] + 0.016)
         out = cheek * neck * front
         nostril = 1 - smoothstep(y, nose[1] - 0.012, nose[1] - 0.008)
@@ -189,7 +189,7 @@ def lash_strands(person: Person, count: int, rng: np.random.Generator):
 
 
 def lid_rim(points: np.ndarray, normals: np.ndarray, centre: np.ndarray, up: int) -> np.ndarray:
-    """Rows of the skin vertices on the edge of a lid, seen from the front (up: +1 upper, -1 lower)."""
+    """Rows of the skin vertices on the edge of a lid (up: +1 upper, -1 lower)."""
     offset = points - centre
     reach = np.linalg.norm(offset, axis=1)
     near = (reach > 0.0155) & (reach < 0.021) & (offset[:, 2] > 0.003) & (normals[:, 2] > 0.05)

@@ -132,7 +132,7 @@ def wave(
     strands: np.ndarray, clumps: np.ndarray, amplitude: float, wavelength: float, rng
 ) -> np.ndarray:
     """Bend strands sideways in waves that a clump shares."""
-    count, steps = strands.shape[:2]
+    count = len(strands)
     pace = np.linalg.norm(np.diff(strands, axis=1), axis=2)
     arc = np.concatenate([np.zeros((count, 1)), np.cumsum(pace, 1)], axis=1)
     number = clumps.max() + 1

@@ -36,9 +36,8 @@ def light_object(number: int, light: AreaLight):
     data.energy, data.color = light.power, light.colour
     data.shape, data.size = "DISK", light.size
     azimuth, elevation = np.radians([light.azimuth, light.elevation])
-    away = np.array(
-        [np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth) * np.cos(elevation)]
-    )
+    level = np.cos(elevation)
+    away = np.array([np.sin(azimuth) * level, np.sin(elevation), np.cos(azimuth) * level])
     item = bpy.data.objects.new(data.name, data)
     right = np.cross([0.0, 1.0, 0.0], away)
     right /= np.linalg.norm(right)

@@ -13,12 +13,12 @@ from ..core.head import HeadModel
 FRAMES_PER_BEAT = 5.0  # a clip is watched at about 10 pictures a second
 
 # One-sided names stand for both sides.
-MOODS = (
+MOODS: tuple[dict[str, float], ...] = (
     {"mouthSmile": 0.75, "cheekSquint": 0.5, "eyeSquint": 0.2},
     {"mouthSmile": 0.55, "mouthUpperUp": 0.45, "mouthLowerDown": 0.35, "cheekSquint": 0.4,
      "jawOpen": 0.10},
     {"browInnerUp": 0.8, "browOuterUp": 0.75, "eyeWide": 0.6, "jawOpen": 0.25},
-    {"browDown": 0.85, "noseSneer": 0.45, "mouthFrown": 0.45, "mouthPress": 0.4, "eyeSquint": 0.4},
+    {"browDown": 0.85, "noseSneer": 0.45, "mouthFrown": 0.45, "mouthPress": 0.4, "eyeSquint": 0.25},
     {"mouthFrown": 0.7, "browInnerUp": 0.6, "mouthShrugLower": 0.5},
     {"mouthPucker": 0.7, "mouthFunnel": 0.2},
     {"cheekPuff": 0.7, "mouthPress": 0.3},
@@ -61,8 +61,8 @@ def perform(head: HeadModel, frames: int, rng: np.random.Generator) -> Motion:
     blink = _blinks(count, rng)
     for name in ("eyeBlinkLeft", "eyeBlinkRight"):
         _add(head, expression, name, blink)
-    _add(head, expression, "eyeWideLeft", 0.12 * (1 - blink))
-    _add(head, expression, "eyeWideRight", 0.12 * (1 - blink))
+    _add(head, expression, "eyeWideLeft", 0.18 * (1 - blink))
+    _add(head, expression, "eyeWideRight", 0.18 * (1 - blink))
 
     yaw = _turns(count, rng, 35.0, 5.5)
     pitch = np.clip(5.5 * _drift(count, 5.0, rng), -13, 13)
@@ -101,7 +101,7 @@ def _add(head: HeadModel, expression: np.ndarray, name: str, values: np.ndarray)
 
 
 def _speech(recipes, count: int, beat: float, rng) -> dict[str, np.ndarray]:
-    """Curves through recipes drawn one a beat, each at a random strength; every recipe has its turn."""
+    """Curves through recipes, one a beat, each at a random strength; all have their turn."""
     step = beat * FRAMES_PER_BEAT
     keys = int(np.ceil(count / step)) + 2
     order = np.concatenate([rng.permutation(len(recipes)) for _ in range(keys // len(recipes) + 1)])
@@ -136,7 +136,7 @@ def _turns(count: int, rng, limit: float, beat: float) -> np.ndarray:
     """Degrees of yaw that sweep both sides: sorted into left, right and middle by turns."""
     keys = int(np.ceil(count / (beat * 1.3))) + 2
     sides = np.where(np.arange(keys) % 2 == rng.integers(2), 1.0, -1.0)
-    size = np.abs(rng.uniform(0.0, 1.0, keys))
+    size = rng.uniform(0.35, 0.95, keys)
     size[rng.permutation(keys)[: keys // 3]] = rng.uniform(0.75, 1.0, keys // 3)
     times = np.arange(keys) * beat * 1.3 - 2
     return limit * np.clip(PchipInterpolator(times, sides * size)(np.arange(count)), -1, 1)
@@ -154,7 +154,7 @@ def _glances(count: int, rng, limit: float, lean: np.ndarray) -> np.ndarray:
 
 
 def _look(head: HeadModel, expression: np.ndarray, gaze: np.ndarray) -> None:
-    """Half of the gaze as eyeLook expressions, which move the lids too (a full one is about 30 deg)."""
+    """Half of the gaze as eyeLook expressions, which move the lids too (full: some 30 degrees)."""
     right, up = gaze[0] / 30, gaze[1] / 25  # positive yaw looks to the person's left
     for name, values in (
         ("eyeLookOutLeft", right), ("eyeLookInRight", right),

@@ -8,7 +8,7 @@ import bpy
 
 
 class Graph:
-    """Builds a node tree: `add` makes a node, keyword arguments set sockets (values or other sockets)."""
+    """Builds a node tree: `add` makes a node, keyword arguments feed its sockets."""
 
     def __init__(self, tree):
         self.tree = tree

@@ -9,7 +9,7 @@ import numpy as np
 def mesh_object(
     name: str, vertices: np.ndarray, quads: np.ndarray, material, *, label=0, smooth=True, **points
 ):
-    """A mesh object; `label` a number or one a face; `points` are vertex attributes ([V] or [V,3])."""
+    """A mesh object; `label`: a number or one a face; `points`: vertex attributes [V] or [V,3]."""
     mesh = bpy.data.meshes.new(name)
     faces = np.ascontiguousarray(quads, np.int32)
     mesh.vertices.add(len(vertices))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 from contextlib import contextmanager
 from pathlib import Path
@@ -34,6 +35,8 @@ def configure(scene, size: int) -> None:
     scene.view_settings.look = "None"
     scene.view_layers[0].use_pass_z = True
     cycles.device = "CPU"
+    if os.environ.get("PAV_THREADS"):
+        render.threads_mode, render.threads = "FIXED", int(os.environ["PAV_THREADS"])
     cycles.seed = 0
     cycles.max_bounces = 3
     cycles.diffuse_bounces = 2
@@ -132,7 +135,7 @@ class Passes:
 
 
 def straight_colour(premultiplied: np.ndarray) -> np.ndarray:
-    """Straight sRGB [H,W,3] from premultiplied linear RGBA; thin coverage borrows from its neighbours.
+    """Straight sRGB [H,W,3] from premultiplied linear RGBA; thin coverage borrows colour.
 
     Dividing by a small alpha amplifies noise, so the quotient of two blurred images takes over
     where the coverage is thin: a colour that comes from the foreground only.
@@ -141,9 +144,10 @@ def straight_colour(premultiplied: np.ndarray) -> np.ndarray:
     colour = rgb / np.maximum(alpha, 1e-4)[..., None]
     for sigma, needed in ((1.0, 0.7), (3.0, 0.15), (8.0, 0.02)):
         weight = ndimage.gaussian_filter(alpha, sigma)
-        spread = np.stack(
-            [ndimage.gaussian_filter(rgb[..., k], sigma) for k in range(3)], axis=-1
-        ) / np.maximum(weight, 1e-5)[..., None]
+        spread = (
+            np.stack([ndimage.gaussian_filter(rgb[..., k], sigma) for k in range(3)], axis=-1)
+            / np.maximum(weight, 1e-5)[..., None]
+        )
         trust = np.clip(alpha / needed, 0.0, 1.0)[..., None]
         colour = trust * colour + (1.0 - trust) * spread
     return to_srgb(np.clip(colour, 0.0, 1.0))
@@ -156,7 +160,7 @@ def to_srgb(linear: np.ndarray) -> np.ndarray:
 
 
 def clean_labels(labels: np.ndarray, matte: np.ndarray, hair: tuple[int, ...]) -> np.ndarray:
-    """Background where the matte is thin; a majority vote of 3x3 where strands make salt and pepper."""
+    """Background where the matte is thin; a vote of 3x3 where strands make salt and pepper."""
     votes = np.stack(
         [ndimage.uniform_filter((labels == k).astype(np.float32), 3) for k in range(11)]
     )

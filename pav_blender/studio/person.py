@@ -1,4 +1,4 @@
-"""The synthetic person's geometry: the built-in head refined for rendering, and where its features lie."""
+"""The synthetic person's geometry: the head model refined for rendering, and its features."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LEVELS = 2
 
 @dataclass(eq=False)
 class Part:
-    """One connected piece of the refined mesh. `vertices` index the refined mesh, `quads` index `vertices`."""
+    """A connected piece of the refined mesh: its rows there, and quads into those rows."""
 
     vertices: np.ndarray
     quads: np.ndarray
@@ -53,7 +53,7 @@ class Person:
     normals: np.ndarray = field(repr=False)  # [V',3] rest normals
     masks: dict[str, np.ndarray] = field(repr=False)  # smooth region masks on the refined mesh
 
-    def posed(self, expression: np.ndarray, pose: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    def posed(self, expression, pose, translation) -> np.ndarray:
         """The head model's vertices [V,3] of these parameters."""
         posed = self.head.pose(self.betas, expression[None], pose[None], translation[None])
         return np.ascontiguousarray(posed[0].numpy(), np.float32)
@@ -157,7 +157,7 @@ def vertex_normals(vertices: np.ndarray, quads: np.ndarray) -> np.ndarray:
 
 
 def joint_transforms(pose: np.ndarray, joints: np.ndarray, parents: np.ndarray) -> np.ndarray:
-    """World matrices [J,4,4] that take rest points to posed ones, as `HeadModel.pose` skins them."""
+    """Matrices [J,4,4] that take rest points to posed ones, as `HeadModel.pose` skins them."""
     out = np.tile(np.eye(4), (len(pose), 1, 1))
     for j, vector in enumerate(np.asarray(pose, float)):
         turn = np.eye(4)
@@ -178,7 +178,7 @@ def rotation(vector: np.ndarray) -> np.ndarray:
 
 
 class Surface:
-    """Signed distance to the rest mesh, near enough for combing hair: nearest vertex and its normal."""
+    """Height over the rest mesh, near enough for combing hair: nearest vertex and its normal."""
 
     def __init__(self, vertices: np.ndarray, normals: np.ndarray):
         self.vertices, self.normals = vertices, normals

@@ -1,4 +1,4 @@
-"""Filming a collection: clips of one person, an appearance each, with exact truth beside the pictures."""
+"""Filming a collection: clips of one person, an appearance each, with the exact truth."""
 
 from __future__ import annotations
 

@@ -103,13 +103,12 @@ def fringe_field(person: Person):
 
 def bun_field(person: Person):
     """Pulled back and up to a knot at the back of the head."""
-    marks = person.landmarks
     knot = knot_centre(person)
 
     def field(points: np.ndarray) -> np.ndarray:
         away = knot - points
         away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-6)
-        return away + [0, 0.1 * (marks.top[1] > 0), 0]
+        return away + np.array([0.0, 0.1, 0.0])
 
     return field
 
@@ -152,7 +151,8 @@ def _lengths(person: Person, style: ScalpStyle, roots: Roots, rng) -> np.ndarray
         length = length * (0.30 + 0.70 * top) * (1 - 0.5 * low)
     if style.kind == "fringe":
         front = smoothstep(z, marks.ear[2] + 0.03, marks.ear[2] + 0.08)
-        length = length * (1 - 0.35 * front * smoothstep(y, marks.eye[1] + 0.05, marks.eye[1] + 0.07))
+        high = smoothstep(y, marks.eye[1] + 0.05, marks.eye[1] + 0.07)
+        length = length * (1 - 0.35 * front * high)
     if style.kind == "long":
         length = length * (0.80 + 0.20 * smoothstep(z, marks.ear[2] + 0.06, marks.ear[2]))
     if style.kind == "bun":

@@ -15,8 +15,6 @@ from .lights import light_object, new_world
 from .objects import delete, mesh_object, move_mesh
 from .person import Person, joint_transforms
 
-# MakeHuman's rows sit high and deep in the mouth and are hardly ever seen: (joint, metres)
-TOOTH_SHIFT = {"upper_teeth": (1, (0.0, -0.0050, 0.0035)), "lower_teeth": (2, (0.0, -0.002, 0.003))}
 LABEL = {name: number for number, name in enumerate(LABELS)}
 
 
@@ -103,10 +101,8 @@ def new_scene(person: Person, lighting) -> StudioScene:
     return StudioScene(person, scene, camera, fixtures=fixtures)
 
 
-def add_body(
-    studio: StudioScene, look: skin.SkinLook, hair_mask, beard_mask, covered
-) -> None:
-    """Skin, eyes, teeth and tongue. The masks [N] darken the skin under hair; `covered` is left out."""
+def add_body(studio: StudioScene, look: skin.SkinLook, hair_mask, beard_mask, covered) -> None:
+    """Skin, eyes, teeth, tongue. Masks [N] darken skin under hair; `covered` is left out."""
     person = studio.person
     part = person.parts["skin"]
     rest = person.fine[part.vertices]
@@ -114,7 +110,9 @@ def add_body(
     extra = {}
     if look.freckles:
         marks = person.landmarks
-        extra["freckle"] = skin.blob(rest, marks.nose + [0.02, 0.01, -0.02], (0.025, 0.014, 0.04))
+        extra["freckle"] = skin.blob(
+            rest, marks.nose + np.array([0.02, 0.01, -0.02]), (0.025, 0.014, 0.04)
+        )
     shown = ~(covered[part.quads].all(1))
     item = mesh_object(
         "studio skin", rest, part.quads[shown], skin.skin_material(look),
@@ -131,7 +129,24 @@ def add_body(
             material = eyes.tongue_material() if name == "tongue" else (
                 eyes.tooth_material(person, name))  # fmt: skip
             item = eyes.tooth_object(person, name, material, LABEL["mouth"])
-            studio.add(PartActor([item], person.parts[name].vertices, *TOOTH_SHIFT.get(name, ())))
+            studio.add(PartActor([item], person.parts[name].vertices, *tooth_shift(person, name)))
+
+
+def tooth_shift(person: Person, name: str) -> tuple[int, tuple[float, float, float]]:
+    """Where a row goes (joint, metres): MakeHuman's sit high and deep and are hardly ever seen.
+
+    The upper edge ends a little below the lips' meeting line, the lower row just behind it.
+    """
+    points, marks = person.fine[person.parts[name].vertices], person.landmarks
+    front = points[points[:, 2] > points[:, 2].max() - 0.006]
+    if name == "upper_teeth":
+        rise = marks.mouth[1] + 0.0003 - front[:, 1].min()
+        return 1, (0.0, float(rise), float(marks.mouth[2] - 0.0105 - points[:, 2].max()))
+    if name == "lower_teeth":
+        rise = marks.mouth[1] - 0.0045 - front[:, 1].max()
+        rise = min(max(rise, -0.004), 0.002)
+        return 2, (0.0, rise, float(marks.mouth[2] - 0.0140 - points[:, 2].max()))
+    return 2, (0.0, 0.0, 0.0)
 
 
 def skin_labels(person: Person, hair_mask, beard_mask) -> np.ndarray:

@@ -7,7 +7,7 @@ from scipy.ndimage import gaussian_filter1d
 
 
 def sweep(path: np.ndarray, radius, sides: int = 10, closed: bool = False, flatten: float = 1.0):
-    """A tube along `path` [N,3]: vertices and quads. `radius` is one or [N]; frames do not twist."""
+    """A tube along `path` [N,3]: vertices and quads; `radius` one or [N]."""
     count = len(path)
     ahead = np.roll(path, -1, 0) if closed else np.concatenate([path[1:], path[-1:]])
     behind = np.roll(path, 1, 0) if closed else np.concatenate([path[:1], path[:-1]])

@@ -43,13 +43,13 @@ def paint(person: Person, look: SkinLook, hair_mask, beard_mask) -> tuple[np.nda
     cheek = np.array([eye[0] * 1.35, 0.55 * nose[1] + 0.1 * eye[1], eye[2] + 0.004])
     red = 0.55 * blob(points, cheek, (0.017, 0.014, 0.03))
     red += 0.75 * blob(points, nose, (0.012, 0.010, 0.016))
-    red += 0.35 * blob(points, chin + [0, 0.012, 0], (0.014, 0.010, 0.02))
+    red += 0.35 * blob(points, chin + np.array([0, 0.012, 0]), (0.014, 0.010, 0.02))
     red += 0.75 * smoothstep(masks["ears"], 0.2, 0.9)
-    red += 0.25 * blob(points, eye + [0.0, -0.008, 0.012], (0.016, 0.006, 0.02))
+    red += 0.25 * blob(points, eye + np.array([0.0, -0.008, 0.012]), (0.016, 0.006, 0.02))
     colour *= 1 - look.redness * np.clip(red, 0, 1)[:, None] * np.array([0.04, 0.27, 0.24])
 
-    socket = blob(points, eye + [-0.004, -0.013, 0.012], (0.012, 0.0055, 0.02))
-    crease = blob(points, eye + [-0.006, 0.009, 0.012], (0.014, 0.005, 0.02))
+    socket = blob(points, eye + np.array([-0.004, -0.013, 0.012]), (0.012, 0.0055, 0.02))
+    crease = blob(points, eye + np.array([-0.006, 0.009, 0.012]), (0.014, 0.005, 0.02))
     dark = 0.20 * (1 + look.lines) * socket + 0.22 * crease
     fold = blob(points, [0.021, 0.5 * (nose[1] + mouth[1]), nose[2] - 0.017], (0.006, 0.012, 0.02))
     dark += 0.22 * look.lines * fold

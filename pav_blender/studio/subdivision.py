@@ -9,26 +9,23 @@ from scipy import sparse
 def quads_of(triangles: np.ndarray) -> np.ndarray:
     """Faces [N,4] of a triangle list [T,3] that was cut from quads; -1 ends a face that was none.
 
-    Two orders are known: the halves (a,b,c), (a,c,d) of a quad follow each other, or all first
-    halves come before all second ones.
+    A quad's halves are (a,b,c) and, anywhere later in the list, (a,c,d): each triangle is joined
+    with the one that starts with its diagonal, unless that one is taken.
     """
-    step = 1
-    partner = np.flatnonzero(
-        (triangles[:, 0] == triangles[0, 0]) & (triangles[:, 1] == triangles[0, 2])
-    )
-    if len(partner):
-        step = int(partner[0])
-    first = np.arange(len(triangles))
-    first = first[first % 2 == 0] if step == 1 else first[:step]
-    first = first[first + step < len(triangles)]
-    a, b = triangles[first], triangles[first + step]
-    fits = (a[:, 0] == b[:, 0]) & (a[:, 2] == b[:, 1])
-    first = first[fits]
-    quads = np.concatenate([triangles[first], triangles[first + step][:, 2:]], axis=1)
-    alone = np.ones(len(triangles), bool)
-    alone[first] = alone[first + step] = False
-    rest = np.pad(triangles[alone], ((0, 0), (0, 1)), constant_values=-1)
-    return np.concatenate([quads, rest]).astype(np.int64)
+    rows = triangles.tolist()
+    starting = {(a, b): number for number, (a, b, _) in enumerate(rows)}
+    taken = [False] * len(rows)
+    quads, alone = [], []
+    for number, (a, b, c) in enumerate(rows):
+        if taken[number]:
+            continue
+        partner = starting.get((a, c), -1)
+        if partner > number and not taken[partner]:
+            taken[partner] = True
+            quads.append((a, b, c, rows[partner][2]))
+        else:
+            alone.append((a, b, c, -1))
+    return np.asarray([*quads, *alone], np.int64).reshape(-1, 4)
 
 
 def subdivide(faces: np.ndarray, count: int) -> tuple[sparse.csr_matrix, np.ndarray]:
@@ -76,9 +73,7 @@ def _vertex_rule(face_vertex, face_point, edge_vertex, edges, border, count) -> 
     face_count = np.maximum(np.asarray(face_vertex.sum(0)).reshape(-1), 1.0)
     around = sparse.diags(1.0 / face_count) @ (face_vertex.T @ face_point)
     midpoints = sparse.diags(1.0 / valence) @ (edge_vertex.T @ (0.5 * edge_vertex))
-    smooth = sparse.diags(1.0 / valence) @ (
-        around + 2.0 * midpoints + sparse.diags(valence - 3.0)
-    )
+    smooth = sparse.diags(1.0 / valence) @ (around + 2.0 * midpoints + sparse.diags(valence - 3.0))
     rim = edges[border]
     neighbours = _incidence(
         np.concatenate([rim[:, 0], rim[:, 1]]), np.concatenate([rim[:, 1], rim[:, 0]]), count, count
