@@ -178,12 +178,28 @@ def test_gradients_only_where_asked():
     assert all(w.grad is None for w in weights)
 
 
+@pytest.mark.parametrize("count", [1, 95, 96, 97, 3000])
+@pytest.mark.parametrize("sizes", [(32, 64, 64, 16), (20, 64, 3)], ids=str)
+def test_inputs_may_lie_feature_by_feature(sizes, count):
+    weights, biases = network(sizes)
+    x, group_bias, group, weight = batch(count, sizes)
+    turned = x.t().contiguous().t()
+    rows = gradients(cpu, x, weights, biases, group_bias, group, weight)
+    columns = gradients(cpu, turned, weights, biases, group_bias, group, weight)
+    assert columns[1].stride() == turned.stride()
+    for one, two in zip(rows, columns, strict=True):
+        torch.testing.assert_close(one, two, rtol=1e-6, atol=1e-6)
+
+
 def test_strided_tensors_work():
     weights, biases = network((16, 64, 4))
     x = torch.randn(100, 32)[:, ::2]
+    x.requires_grad_()
     got = cpu.mlp(x, [weights[0].t().contiguous().t(), weights[1]], biases)
     want = reference.mlp(x, weights, biases)
     torch.testing.assert_close(got, want, rtol=1e-5, atol=1e-5)
+    (one,), (two,) = (torch.autograd.grad(out.sum(), x) for out in (got, want))
+    torch.testing.assert_close(one, two, rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("kernels", [reference, cpu], ids=["reference", "cpu"])

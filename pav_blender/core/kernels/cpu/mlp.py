@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -35,14 +36,17 @@ def mlp(
     group_bias: Tensor | None = None,
     group: Tensor | None = None,
 ) -> Tensor:
-    """As the reference, in float32; hidden values are not kept but computed again for gradients."""
+    """As the reference, in float32; hidden values are not kept but computed again for gradients.
+
+    x may lie in memory row by row or, as `encode` leaves it, feature by feature.
+    """
     reference.check_mlp(x, weights, biases, group_bias, group)
     return _Mlp.apply(x, group_bias, group, *weights, *biases)
 
 
 @dataclass(frozen=True)
 class Gradients:
-    """What `mlp_backward` returns; `x` and `group_bias` where they were asked for."""
+    """What `mlp_backward` returns; x only where it was asked for, laid out as the input was."""
 
     x: Tensor | None
     weights: list[Tensor]
@@ -62,24 +66,26 @@ def mlp_backward(
 ) -> Gradients:
     """Gradients of `mlp` given that of its output [N,out]; the same for any number of threads."""
     reference.check_mlp(x, weights, biases, group_bias, group)
-    net = _Net.pack(weights, biases)
+    plan, packed = _pack(weights, biases)
     count = len(x)
     blocks = -(-count // BLOCK)
     parts = max(1, min(PARTS, blocks // 4))
     size = -(-blocks // parts) * BLOCK
-    sums = np.zeros((parts, net.sums), np.float32)
-    grad_x = torch.empty(count if need_x else 0, x.shape[1])
-    bias_rows, which = _group_arrays(group_bias, group, count)
-    spans = _group_spans(which, count, size, parts)
+    sums = np.zeros((parts, _sums_size(plan)), np.float32)
+    values, turned = _rows(x)
+    grad_x = torch.empty(values.shape if need_x else (0, 0))
+    bias_rows, which = _group_arrays(group_bias, group)
+    spans = _group_spans(which, size, parts)
     group_sums = np.zeros((int(spans[:, 2].sum()), bias_rows.shape[1]), np.float32)
     run_chunks(
-        _backward_part,
+        _backward_parts,
         parts,
         1,
         size,
-        _array(x),
-        net.packed,
-        net.plan,
+        values,
+        turned,
+        packed,
+        plan,
         bias_rows,
         which,
         _array(grad_out),
@@ -88,14 +94,15 @@ def mlp_backward(
         spans,
         group_sums,
     )
-    total = sums.sum(0)
-    grad_weights, grad_biases = net.unpack(total)
+    grad_weights, grad_biases = _unpack(plan, sums.sum(0))
     grad_group = None
     if group_bias is not None:
         summed = np.zeros(tuple(group_bias.shape), np.float32)
         for low, at, length in spans:
             summed[low : low + length] += group_sums[at : at + length]
         grad_group = torch.from_numpy(summed)
+    if turned:
+        grad_x = grad_x.t()
     return Gradients(grad_x if need_x else None, grad_weights, grad_biases, grad_group)
 
 
@@ -105,10 +112,10 @@ class _Mlp(torch.autograd.Function):
         ctx: Any, x: Tensor, group_bias: Tensor | None, group: Tensor | None, *layers: Tensor
     ) -> Tensor:
         ctx.save_for_backward(x, group_bias, group, *layers)
-        net = _Net.pack(layers[: len(layers) // 2], layers[len(layers) // 2 :])
-        out = torch.empty(len(x), int(net.plan[-1, OUT]))
-        bias_rows, which = _group_arrays(group_bias, group, len(x))
-        arrays = (_array(x), net.packed, net.plan, bias_rows, which, out.numpy())
+        half = len(layers) // 2
+        plan, packed = _pack(layers[:half], layers[half:])
+        out = torch.empty(len(x), len(layers[-1]))
+        arrays = (*_rows(x), packed, plan, *_group_arrays(group_bias, group), out.numpy())
         run_chunks(_forward_samples, len(x), CHUNK, *arrays)
         return out
 
@@ -123,71 +130,72 @@ class _Mlp(torch.autograd.Function):
         return result.x, result.group_bias, None, *result.weights, *result.biases
 
 
-@dataclass(frozen=True)
-class _Net:
-    """Weights laid out for `tiles.multiply`: padded, both ways round, in one array."""
+@lru_cache(maxsize=64)
+def _plan(sizes: tuple[int, ...]) -> np.ndarray:
+    """Where everything of a network lies: [layers, 10] int64."""
+    plan = np.zeros((len(sizes) - 1, 10), np.int64)
+    at = sums = 0
+    hidden = BLOCK * _padded(sizes[0])  # after the inputs
+    for row, ins, outs in zip(plan, sizes[:-1], sizes[1:], strict=True):
+        in_pad, out_pad = _padded(ins), _padded(outs)
+        bias = at + ins * out_pad
+        grad_bias = sums + -(-outs // ROWS) * ROWS * in_pad
+        row[:] = ins, outs, in_pad, out_pad, at, bias, bias + out_pad, hidden, sums, grad_bias
+        at = bias + out_pad + outs * in_pad
+        hidden += BLOCK * out_pad
+        sums = grad_bias + out_pad
+    return plan
 
-    packed: np.ndarray
-    plan: np.ndarray  # [layers, 10]
-    sums: int  # floats of the gradients of all layers
 
-    @staticmethod
-    def pack(weights: Sequence[Tensor], biases: Sequence[Tensor]) -> _Net:
-        plan = np.zeros((len(weights), 10), np.int64)
-        at = sums = 0
-        hidden = BLOCK * _padded(weights[0].shape[1])  # after the inputs
-        for row, weight in zip(plan, weights, strict=True):
-            outs, ins = weight.shape
-            row[: BACKWARD + 1] = ins, outs, _padded(ins), _padded(outs), at, 0, 0
-            row[BIAS] = at + ins * row[OUT_PAD]
-            row[BACKWARD] = row[BIAS] + row[OUT_PAD]
-            at = row[BACKWARD] + outs * row[IN_PAD]
-            row[HIDDEN] = hidden
-            hidden += BLOCK * row[OUT_PAD]
-            row[GRAD_WEIGHT] = sums
-            row[GRAD_BIAS] = sums + -(-outs // ROWS) * ROWS * row[IN_PAD]
-            sums = row[GRAD_BIAS] + row[OUT_PAD]
-        packed = np.zeros(at, np.float32)
-        for row, weight, bias in zip(plan, weights, biases, strict=True):
-            matrix, (ins, outs) = _array(weight), row[:2]
-            forward = packed[row[FORWARD] : row[BIAS]].reshape(ins, row[OUT_PAD])
-            forward[:, :outs] = matrix.T
-            packed[row[BIAS] : row[BIAS] + outs] = _array(bias)
-            backward = packed[row[BACKWARD] : row[BACKWARD] + outs * row[IN_PAD]]
-            backward.reshape(outs, row[IN_PAD])[:, :ins] = matrix
-        return _Net(packed, plan, int(sums))
+def _sums_size(plan: np.ndarray) -> int:
+    return int(plan[-1, GRAD_BIAS] + plan[-1, OUT_PAD])
 
-    def unpack(self, sums: np.ndarray) -> tuple[list[Tensor], list[Tensor]]:
-        """Gradients of weights and biases from the sums of all layers."""
-        weights, biases = [], []
-        for row in self.plan:
-            ins, outs, pad = row[IN], row[OUT], row[IN_PAD]
-            weight = sums[row[GRAD_WEIGHT] : row[GRAD_WEIGHT] + outs * pad].reshape(outs, pad)
-            weights.append(torch.from_numpy(weight[:, :ins].copy()))
-            biases.append(torch.from_numpy(sums[row[GRAD_BIAS] : row[GRAD_BIAS] + outs].copy()))
-        return weights, biases
+
+def _pack(weights: Sequence[Tensor], biases: Sequence[Tensor]) -> tuple[np.ndarray, np.ndarray]:
+    """The plan, and in one array all weights as `tiles.multiply` wants them: padded, both ways."""
+    plan = _plan((weights[0].shape[1], *(len(bias) for bias in biases)))
+    last = plan[-1]
+    packed = np.zeros(last[BACKWARD] + last[OUT] * last[IN_PAD], np.float32)
+    for row, weight, bias in zip(plan, weights, biases, strict=True):
+        _pack_layer(_array(weight), _array(bias), row, packed)
+    return plan, packed
+
+
+def _unpack(plan: np.ndarray, sums: np.ndarray) -> tuple[list[Tensor], list[Tensor]]:
+    """Gradients of weights and biases from the sums of all layers."""
+    weights, biases = [], []
+    for row in plan:
+        ins, outs, pad = row[IN], row[OUT], row[IN_PAD]
+        weight = sums[row[GRAD_WEIGHT] : row[GRAD_WEIGHT] + outs * pad].reshape(outs, pad)
+        weights.append(torch.from_numpy(weight[:, :ins].copy()))
+        biases.append(torch.from_numpy(sums[row[GRAD_BIAS] : row[GRAD_BIAS] + outs].copy()))
+    return weights, biases
 
 
 def _padded(size: int) -> int:
     return -(-size // LANES) * LANES
 
 
-def _group_arrays(
-    group_bias: Tensor | None, group: Tensor | None, count: int
-) -> tuple[np.ndarray, np.ndarray]:
+def _rows(x: Tensor) -> tuple[np.ndarray, bool]:
+    """The inputs as an array [N,in], or [in,N] and True where they lie feature by feature."""
+    turned = not x.is_contiguous() and x.t().is_contiguous()
+    return _array(x.t() if turned else x), turned
+
+
+def _group_arrays(group_bias: Tensor | None, group: Tensor | None) -> tuple[np.ndarray, np.ndarray]:
     if group_bias is None or group is None:
         return np.zeros((0, 0), np.float32), np.zeros(0, np.int32)
     return _array(group_bias), group.detach().to(torch.int32).contiguous().numpy()
 
 
-def _group_spans(which: np.ndarray, count: int, size: int, parts: int) -> np.ndarray:
+def _group_spans(which: np.ndarray, size: int, parts: int) -> np.ndarray:
     """Lowest group, first row of its own sums, and number of rows, for every part.
 
     Groups mostly come in order (rays, frames), so that the parts' sums barely overlap.
     """
     spans = np.zeros((parts, 3), np.int64)
     at = 0
-    for part in range(parts if len(which) else 0):
+    for part in range(parts):
         mine = which[part * size : (part + 1) * size]
         if len(mine):
             low, high = int(mine.min()), int(mine.max())
@@ -205,6 +213,17 @@ def _array(tensor: Tensor) -> Any:
 
 
 @njit(cache=True, nogil=True)
+def _pack_layer(weight, bias, row, packed):
+    ins, outs, in_pad, out_pad = row[IN], row[OUT], row[IN_PAD], row[OUT_PAD]
+    forward, backward = row[FORWARD], row[BACKWARD]
+    for o in range(outs):
+        packed[row[BIAS] + o] = bias[o]
+        for i in range(ins):
+            packed[forward + i * out_pad + o] = weight[o, i]
+            packed[backward + o * in_pad + i] = weight[o, i]
+
+
+@njit(cache=True, nogil=True)
 def _scratch(plan):
     """Room for a block's inputs and the results of all layers; products may read a little past."""
     last = plan[-1]
@@ -212,76 +231,112 @@ def _scratch(plan):
 
 
 @njit(cache=True, nogil=True)
-def _copy_in(source, begin, count, work, at, step):
-    """Rows of source as rows of work; what is left of the block becomes zero."""
-    width = source.shape[1]
-    for i in range(count):
-        row = work[at + i * step : at + (i + 1) * step]
+def _copy_in(source, turned, begin, count, work, at, step):
+    """Samples of source as rows of work; what is left of the block becomes zero."""
+    width = len(source) if turned else source.shape[1]
+    if turned:
         for k in range(width):
-            row[k] = source[begin + i, k]
-        row[width:] = 0
+            line = source[k, begin : begin + count]
+            for i in range(count):
+                work[at + i * step + k] = line[i]
+    else:
+        for i in range(count):
+            row = work[at + i * step : at + i * step + width]
+            for k in range(width):
+                row[k] = source[begin + i, k]
+    if width < step:
+        for i in range(count):
+            work[at + i * step + width : at + (i + 1) * step] = 0
     work[at + count * step : at + BLOCK * step] = 0
 
 
 @njit(cache=True, nogil=True)
-def _copy_out(work, at, step, target, begin, count):
-    for i in range(count):
-        row = work[at + i * step : at + (i + 1) * step]
-        for k in range(target.shape[1]):
-            target[begin + i, k] = row[k]
+def _copy_out(work, at, step, target, turned, begin, count):
+    if turned:
+        for k in range(len(target)):
+            line = target[k, begin : begin + count]
+            for i in range(count):
+                line[i] = work[at + i * step + k]
+    else:
+        for i in range(count):
+            row = work[at + i * step : at + (i + 1) * step]
+            for k in range(target.shape[1]):
+                target[begin + i, k] = row[k]
 
 
 @njit(cache=True, nogil=True)
-def _forward_block(begin, count, layers, x, packed, plan, bias_rows, group, work):
-    """The first `layers` layers of samples begin to begin + count; results stay in work."""
-    last = len(plan) - 1
-    first = plan[0]
-    _copy_in(x, begin, count, work, 0, first[IN_PAD])
-    at, step = 0, first[IN_PAD]
+def _group_rows(begin, count, row, packed, bias_rows, group, work):
+    """What the first layer's sums begin with: its bias plus that of every sample's group."""
+    at, step = row[HIDDEN], row[OUT_PAD]
+    bias = packed[row[BIAS] : row[BIAS] + step]
+    for i in range(count):
+        line = work[at + i * step : at + (i + 1) * step]
+        extra = bias_rows[group[begin + i]]
+        for k in range(len(extra)):
+            line[k] = bias[k] + extra[k]
+        for k in range(len(extra), step):
+            line[k] = 0
+    work[at + count * step : at + BLOCK * step] = 0
+
+
+@njit(cache=True, nogil=True)
+def _layers(begin, count, rows, layers, x, x_at, x_step, x_stride,
+            packed, plan, bias_rows, group, work):  # fmt: skip
+    """The first `layers` layers of `rows` samples, of which `count` are real; results in work.
+
+    The inputs x are walked as `a` of a product.
+    """
+    a, at, step, stride = x, x_at, x_step, x_stride
     for layer in range(layers):
         row = plan[layer]
         out_at, out_step = row[HIDDEN], row[OUT_PAD]
-        finish = RELU if layer < last else PLAIN
+        finish = RELU if layer < len(plan) - 1 else PLAIN
         init, init_at, init_step = packed, row[BIAS], 0
         if layer == 0 and len(bias_rows) > 0:
-            bias = packed[row[BIAS] : row[BIAS] + out_step]
-            for i in range(count):
-                line = work[out_at + i * out_step : out_at + (i + 1) * out_step]
-                extra = bias_rows[group[begin + i]]
-                for k in range(len(extra)):
-                    line[k] = bias[k] + extra[k]
-                line[len(extra) :] = 0
-            work[out_at + count * out_step : out_at + BLOCK * out_step] = 0
+            _group_rows(begin, count, row, packed, bias_rows, group, work)
             init, init_at, init_step = work, out_at, out_step
-        multiply(BLOCK, row[OUT], row[IN], finish, work, out_at, out_step,
-                 init, init_at, init_step, work, at, step, 1,
+        multiply(rows, row[OUT], row[IN], finish, work, out_at, out_step,
+                 init, init_at, init_step, a, at, step, stride,
                  packed, row[FORWARD], out_step, work, out_at, out_step)  # fmt: skip
-        at, step = out_at, out_step
+        a, at, step, stride = work, out_at, out_step, 1
 
 
 @njit(cache=True, nogil=True)
-def _forward_samples(start, stop, x, packed, plan, bias_rows, group, out):
+def _forward_samples(start, stop, x, turned, packed, plan, bias_rows, group, out):
     work = _scratch(plan)
-    last = plan[-1]
+    flat = x.ravel()
+    first, last = plan[0], plan[-1]
     for begin in range(start, stop, BLOCK):
         count = min(BLOCK, stop - begin)
-        _forward_block(begin, count, len(plan), x, packed, plan, bias_rows, group, work)
-        _copy_out(work, last[HIDDEN], last[OUT_PAD], out, begin, count)
+        if count < BLOCK:
+            # Tiles are read whole, so that samples past the end must exist.
+            _copy_in(x, turned, begin, count, work, 0, first[IN_PAD])
+            a, at, step, stride = work, 0, first[IN_PAD], 1
+        elif turned:
+            a, at, step, stride = flat, begin, 1, x.shape[1]
+        else:
+            a, at, step, stride = flat, begin * first[IN], first[IN], 1
+        _layers(begin, count, count, len(plan), a, at, step, stride,
+                packed, plan, bias_rows, group, work)  # fmt: skip
+        _copy_out(work, last[HIDDEN], last[OUT_PAD], out, False, begin, count)
 
 
 @njit(cache=True, nogil=True)
-def _backward_part(first, end, size, x, packed, plan, bias_rows, group, grad_out, grad_x,
-                   sums, spans, group_sums):  # fmt: skip
+def _backward_parts(first, end, size, x, turned, packed, plan, bias_rows, group, grad_out, grad_x,
+                    sums, spans, group_sums):  # fmt: skip
     work = _scratch(plan)
     slopes = np.zeros_like(work)
     zeros = np.zeros(plan[:, IN_PAD].max(), np.float32)
-    last = plan[-1]
+    start, last = plan[0], plan[-1]
+    total = len(grad_out)
     for part in range(first, end):
-        stop = min((part + 1) * size, len(x))
+        stop = min((part + 1) * size, total)
         for begin in range(part * size, stop, BLOCK):
             count = min(BLOCK, stop - begin)
-            _forward_block(begin, count, len(plan) - 1, x, packed, plan, bias_rows, group, work)
-            _copy_in(grad_out, begin, count, slopes, last[HIDDEN], last[OUT_PAD])
+            _copy_in(x, turned, begin, count, work, 0, start[IN_PAD])
+            _layers(begin, count, BLOCK, len(plan) - 1, work, 0, start[IN_PAD], 1,
+                    packed, plan, bias_rows, group, work)  # fmt: skip
+            _copy_in(grad_out, False, begin, count, slopes, last[HIDDEN], last[OUT_PAD])
             for layer in range(len(plan) - 1, -1, -1):
                 row = plan[layer]
                 at, step = row[HIDDEN], row[OUT_PAD]
@@ -298,15 +353,15 @@ def _backward_part(first, end, size, x, packed, plan, bias_rows, group, grad_out
                              zeros, 0, 0, slopes, at, step, 1,
                              packed, row[BACKWARD], in_step, work, in_at, in_step)  # fmt: skip
             if len(bias_rows) > 0:
-                row = plan[0]
-                low, own = spans[part, 0], spans[part, 1]
+                own = spans[part, 1] - spans[part, 0]
                 for i in range(count):
-                    total = group_sums[own + group[begin + i] - low]
-                    line = slopes[row[HIDDEN] + i * row[OUT_PAD] :]
-                    for k in range(len(total)):
-                        total[k] += line[k]
+                    target = group_sums[own + group[begin + i]]
+                    at = start[HIDDEN] + i * start[OUT_PAD]
+                    line = slopes[at : at + len(target)]
+                    for k in range(len(target)):
+                        target[k] += line[k]
             if len(grad_x) > 0:
-                _copy_out(slopes, 0, plan[0, IN_PAD], grad_x, begin, count)
+                _copy_out(slopes, 0, start[IN_PAD], grad_x, turned, begin, count)
 
 
 @njit(cache=True, nogil=True)
