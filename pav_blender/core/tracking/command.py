@@ -6,7 +6,8 @@ import argparse
 import sys
 from pathlib import Path
 
-from .track import Progress, ShouldStop, track
+from ..progress import Progress
+from .track import ShouldStop, track
 
 HELP = "videos of one person -> a collection: landmarks, head fit, crop, matte"
 EXAMPLE = "pav track morning.mp4 evening.mp4 --out me --appearance plain --appearance glasses"
@@ -44,11 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--overwrite", action="store_true", help="replace an older collection")
 
 
-def run(
-    args: argparse.Namespace,
-    progress: Progress | None = None,
-    should_stop: ShouldStop | None = None,
-) -> int:
+def run(args: argparse.Namespace, should_stop: ShouldStop | None = None) -> int:
     """Runs the verb and prints one line a clip. Raises what `track` raises; returns 0."""
     report = track(
         args.videos,
@@ -61,7 +58,7 @@ def run(
         model=args.landmark_model,
         cut_background=args.matte == "segment",
         overwrite=args.overwrite,
-        progress=progress,
+        progress=Progress("track", as_json=getattr(args, "json_progress", False)),
         should_stop=should_stop,
     )
     for line in report.warnings:

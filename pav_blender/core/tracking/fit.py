@@ -52,7 +52,7 @@ class _Clip:
     target: np.ndarray  # [F,L,2]
     trust: np.ndarray  # [F,L]
     scatter: float  # pixels
-    focal: float
+    focal: float  # the prior's mean; found with the first guess
     mean: np.ndarray  # [F,n]
     weight: np.ndarray  # [n]
     triples: np.ndarray  # rows i with i-1, i, i+1 evenly spaced in time
@@ -63,7 +63,7 @@ def fit_head(
     seen: list[Observations],
     *,
     shapes: int = 60,
-    iterations: int = 25,
+    iterations: int = 12,
     progress: Callable[[float], None] | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> HeadFit:
@@ -90,7 +90,7 @@ def fit_head(
             _normal(model, prior, data, index, weights[index], betas, clips)
             for index in range(len(data))
         ]
-        _add_shared_priors(normals[0], data, betas, clips)
+        _add_shared_priors(model, normals[0], data, betas, clips)
         for _ in range(8):
             candidate = _stepped(normals, damping, betas, clips)
             after = _cost(model, prior, data, weights, *candidate)
@@ -103,7 +103,7 @@ def fit_head(
             break
         if progress is not None:
             progress((step + 1) / iterations)
-        if abs(before - after) < 2e-4 * before and abs(previous - before) < 2e-3 * before:
+        if abs(before - after) < 1e-3 * before and abs(previous - before) < 5e-3 * before:
             break
         previous = before
     if not np.isfinite(betas).all():
@@ -142,7 +142,7 @@ def _prepare(head: HeadModel, seen: Observations, prior: priors.FramePrior) -> _
         target,
         priors.iris_trust(seen.landmarks) * priors.landmark_weights() * priors.INDEPENDENT,
         priors.SCATTER * max(face, 1.0),
-        priors.FOCAL_OF_SIDE * max(seen.width, seen.height),
+        0.0,
         mean,
         whole,
         np.flatnonzero(even) + 1,
@@ -173,7 +173,9 @@ def _first_guess(model: LandmarkModel, clip: _Clip, seen: Observations) -> ClipF
     expression = clip.mean[:, clip.mean.shape[1] - model.expressions :].copy()
     posed = model.pose(np.zeros(model.shapes), expression, pose, np.zeros((frames, 3)))
     centre = posed.points[:, use].mean(axis=1)
-    depth = clip.focal / scale.clip(1e-6)
+    scale = scale.clip(1e-6)
+    clip.focal = priors.focal_guess(max(seen.width, seen.height), float(np.median(scale)))
+    depth = clip.focal / scale
     aim = clip.target[:, use].mean(axis=1) * (depth / clip.focal)[:, None]
     place = np.stack([aim[:, 0], -aim[:, 1], -depth], axis=1)
     return ClipFit(clip.focal, root, pose, place - centre, expression)
@@ -240,7 +242,8 @@ def _cost(
     betas: np.ndarray,
     clips: list[ClipFit],
 ) -> float:
-    total = float((betas**2).sum())
+    grown = float(model.growth @ betas) / priors.SIZE_SPREAD
+    total = _looks(clips) * (float((betas**2).sum()) + grown**2)
     for clip, weight, fit in zip(data, weights, clips, strict=True):
         posed = model.pose(betas, fit.expression, fit.pose, fit.translation)
         missed = _project(posed.points, fit.focal) - clip.target
@@ -253,8 +256,14 @@ def _cost(
             total += stiff * float(((values[:, i] - values[:, j]) ** 2).sum())
         total += float((prior.steady * _bends(values, clip.triples) ** 2).sum())
         total += float((fit.root**2).sum()) / priors.ROOT_SPREAD**2
-        total += np.log(fit.focal / clip.focal) ** 2 / priors.FOCAL_SPREAD**2
+        looks = _looks([fit])
+        total += looks * np.log(fit.focal / clip.focal) ** 2 / priors.FOCAL_SPREAD**2
     return total
+
+
+def _looks(clips: list[ClipFit]) -> float:
+    """Weight of the priors on what all frames share, see priors.FRAMES_A_LOOK."""
+    return max(1.0, sum(len(fit.pose) for fit in clips) / priors.FRAMES_A_LOOK)
 
 
 def _bends(values: np.ndarray, triples: np.ndarray) -> np.ndarray:
@@ -291,7 +300,7 @@ def _normal(
         borders *= root[..., None]
         transposed = jacobian.transpose(0, 2, 1)
         own[rows] = transposed @ jacobian
-        border[rows, :, columns] = (transposed @ borders).transpose(2, 0, 1)
+        border[rows, :, columns] = transposed @ borders
         gradient[rows] = (transposed @ residual[..., None])[..., 0]
         flat = borders.reshape(-1, len(columns))
         common[np.ix_(columns, columns)] += flat.T @ flat
@@ -346,16 +355,25 @@ def _linearised(
 
 
 def _add_shared_priors(
-    normal: bordered.Normal, data: list[_Clip], betas: np.ndarray, clips: list[ClipFit]
+    model: LandmarkModel,
+    normal: bordered.Normal,
+    data: list[_Clip],
+    betas: np.ndarray,
+    clips: list[ClipFit],
 ) -> None:
     diagonal = np.einsum("ii->i", normal.shared)
     count = len(betas)
-    diagonal[:count] += 1
-    normal.shared_gradient[:count] += betas
+    stiff = _looks(clips)
+    diagonal[:count] += stiff
+    normal.shared_gradient[:count] += stiff * betas
+    growth = model.growth / priors.SIZE_SPREAD
+    normal.shared[:count, :count] += stiff * np.outer(growth, growth)
+    normal.shared_gradient[:count] += stiff * growth * float(growth @ betas)
     for index, (clip, fit) in enumerate(zip(data, clips, strict=True)):
         at = count + 4 * index
-        diagonal[at] += 1 / priors.FOCAL_SPREAD**2
-        normal.shared_gradient[at] += np.log(fit.focal / clip.focal) / priors.FOCAL_SPREAD**2
+        stiff = _looks([fit]) / priors.FOCAL_SPREAD**2
+        diagonal[at] += stiff
+        normal.shared_gradient[at] += stiff * np.log(fit.focal / clip.focal)
         diagonal[at + 1 : at + 4] += 1 / priors.ROOT_SPREAD**2
         normal.shared_gradient[at + 1 : at + 4] += fit.root / priors.ROOT_SPREAD**2
 

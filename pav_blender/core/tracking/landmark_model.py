@@ -97,6 +97,14 @@ class LandmarkModel:
         normals[[*LIPS, *RIGHT_LIDS, *LEFT_LIDS, *RIGHT_IRIS, *LEFT_IRIS]] = (0, 0, 1)
         return normals / np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-12)
 
+    @cached_property
+    def growth(self) -> np.ndarray:
+        """Relative growth of the face by one unit of each identity component, [shapes]."""
+        rest = self.rest.sum(axis=1)
+        rest = rest - rest.mean(axis=0)
+        basis = self.basis[..., : self.shapes].sum(axis=1)
+        return np.einsum("lx,lxb->b", rest, basis) / (rest**2).sum()
+
     def pose(
         self,
         betas: np.ndarray,

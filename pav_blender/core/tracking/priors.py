@@ -24,9 +24,26 @@ from .observe import LANDMARKS
 SCATTER = 0.006
 INDEPENDENT = 0.2
 SCORE_SPREAD = 0.2
-# field of view along the longer side: 35 to 50 degrees covers most portraits
-FOCAL_OF_SIDE, FOCAL_SPREAD = 1.3, 0.12
+# Landmarks hardly tell a near head under a wide lens from a far one under a long lens. Two guesses
+# are weighed: a portrait's field of view (some 42 degrees, unless the video was cropped before)
+# and the distance one is filmed from; spreads are of logarithms.
+FOCAL_OF_SIDE, FOCAL_OF_SIDE_SPREAD = 1.3, 0.6
+METRES_AWAY, METRES_AWAY_SPREAD = 1.0, 0.3
+FOCAL_SPREAD = 0.1
 ROOT_SPREAD, NECK_SPREAD = 0.12, 0.25
+# A landmark's place on the head is itself uncertain, and no number of frames cures that: so many
+# frames of a clip add up to one independent look at what stays the same (identity, lens).
+FRAMES_A_LOOK = 12
+# One camera cannot see how large a head is; left alone, heads shrink, for then the same components
+# bend them more cheaply. Relative spread of a head's size about its model's.
+SIZE_SPREAD = 0.001
+
+
+def focal_guess(side: float, pixels_per_metre: float) -> float:
+    """Focal length in pixels: of a picture's longer side, and of how large the head is in it."""
+    views = np.log([FOCAL_OF_SIDE * side, METRES_AWAY * pixels_per_metre])
+    weights = np.array([FOCAL_OF_SIDE_SPREAD, METRES_AWAY_SPREAD]) ** -2.0
+    return float(np.exp(np.average(views, weights=weights)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +71,8 @@ _JOINTS = {
     "left_eye": (0.0, (0.25, 0.3, 0.005), 0.15),
     "right_eye": (0.0, (0.25, 0.3, 0.005), 0.15),
 }
+# what landmarks hardly show, and would be used to mend the identity
+_UNSEEN = {"cheekPuff": 0.1, "tongueOut": 0.02, "jawForward": 0.1}
 _OTHER_JOINT = (0.0, (0.05, 0.05, 0.05), 0.02)
 _TRANSLATION_JITTER = (0.0008, 0.0008, 0.003)
 
@@ -69,6 +88,9 @@ def frame_prior(head: HeadModel) -> FramePrior:
     low, high = [], []
     for name in head.joint_names[1:]:
         middle, spreads, shake = _JOINTS.get(name, _OTHER_JOINT)
+        if name == "jaw" and "jawOpen" in head.expression_names:
+            # the expression does it, for that is what an animator or a face capture will drive
+            middle, spreads = 0.0, (0.01, 0.005, 0.005)
         mean += [middle, 0.0, 0.0]
         spread += list(spreads)
         jitter += [shake] * 3
@@ -82,12 +104,12 @@ def frame_prior(head: HeadModel) -> FramePrior:
     count = len(head.expression_basis)
     shapes = is_blend_shapes(head)
     mean += [0.0] * count
-    spread += [0.3 if shapes else 1.0] * count
+    spread += [_UNSEEN.get(name, 0.3 if shapes else 1.0) for name in head.expression_names]
     jitter += [0.3 if shapes else 1.0] * count
     low += [0.0 if shapes else -np.inf] * count
     high += [1.0 if shapes else np.inf] * count
     size = len(mean)
-    wall = np.full(size, 1 / 0.03**2)
+    wall = np.full(size, 1 / 0.005**2)
     return FramePrior(
         np.array(mean),
         1 / np.array(spread) ** 2,
@@ -119,7 +141,7 @@ def expected_expression(
         return mean, weight
     where = {name: column for column, name in enumerate(score_names)}
     for column, name in enumerate(head.expression_names):
-        if name in where:
+        if name in where and name not in _UNSEEN:
             mean[:, column] = scores[:, where[name]]
             weight[column] = 1 / SCORE_SPREAD**2
     return mean, weight

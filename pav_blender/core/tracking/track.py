@@ -12,13 +12,13 @@ import numpy as np
 from ..collection import Clip, CollectionWriter
 from ..errors import Cancelled, InputError
 from ..head import HeadModel, load_head
+from ..progress import Report
 from . import matte
 from .crop import Crop, content_box, cut, plan_crop
 from .decode import Frame, Video, open_video
 from .fit import ClipFit, fit_head, world
 from .observe import Observations, make_detector, observe
 
-Progress = Callable[[float, str], None]
 ShouldStop = Callable[[], bool]
 
 TEST_SHARE = 0.1
@@ -63,7 +63,7 @@ def track(
     model: Path | str | None = None,
     cut_background: bool = True,
     overwrite: bool = False,
-    progress: Progress | None = None,
+    progress: Report | None = None,
     should_stop: ShouldStop | None = None,
 ) -> TrackReport:
     """Tracks the head in `videos` of one person and writes the collection `out`.
@@ -71,7 +71,7 @@ def track(
     size: side of the written pictures; every, max_frames: which frames of each video; appearances:
     one name a video (default: the files' names; videos may share one); head: "builtin" or a head
     file; model: a MediaPipe face landmarker `.task` file; cut_background: False writes pictures
-    opaque; progress(fraction, what). The last tenth of every clip becomes its test split.
+    opaque; progress(fraction, step=what). The last tenth of every clip becomes its test split.
     Raises InputError for videos that cannot be read or show no face, and Cancelled; then nothing
     is written.
     """
@@ -79,7 +79,7 @@ def track(
     out = Path(out)
     if out.exists() and not (overwrite and (out / "collection.json").is_file()):
         raise InputError(f"{out}: exists already; choose another folder or give --overwrite")
-    tell = progress or (lambda fraction, what: None)
+    tell = progress or _silent
     head_model = load_head(head)
     opened = [open_video(path) for path in videos]
     names = clip_names([video.path for video in opened])
@@ -99,7 +99,7 @@ def track(
     fit = fit_head(
         head_model,
         [source.seen for source in sources],
-        progress=lambda done: tell(_OBSERVING + _FITTING * done, "fitting the head"),
+        progress=lambda done: tell(_OBSERVING + _FITTING * done, step="fitting the head"),
         should_stop=should_stop,
     )
     warnings = [line for video in opened for line in video.warnings]
@@ -117,7 +117,7 @@ def track(
             writer.clip(clip)
             tell_clip = _part(tell, start + share * index, share)
             _write_pictures(writer, clip, done, cut_background, tell_clip, should_stop)
-    tell(1.0, "done")
+    tell(1.0, step="done")
     return TrackReport(out, reports, warnings)
 
 
@@ -129,6 +129,10 @@ class _Track:
     rows: np.ndarray
     fit: ClipFit
     report: dict
+
+
+def _silent(fraction: float, **fields: object) -> None:
+    pass
 
 
 def clip_names(paths: Sequence[Path]) -> list[str]:
@@ -164,8 +168,8 @@ def _check(
         )
 
 
-def _part(tell: Progress, start: float, share: float) -> Progress:
-    return lambda fraction, what: tell(start + share * fraction, what)
+def _part(tell: Report, start: float, share: float) -> Report:
+    return lambda fraction, **fields: tell(start + share * fraction, **fields)
 
 
 def _look(
@@ -174,7 +178,7 @@ def _look(
     appearance: str,
     which: tuple[int, int | None],
     model: Path | str | None,
-    tell: Progress,
+    tell: Report,
     should_stop: ShouldStop | None,
 ) -> _Source:
     samples: list[np.ndarray] = []
@@ -187,7 +191,7 @@ def _look(
         if seen_frames % max(1, expected // _BOX_SAMPLES) == 0 and len(samples) < 2 * _BOX_SAMPLES:
             samples.append(frame.rgb)
         seen_frames += 1
-        tell(min(1.0, seen_frames / expected), f"looking at {name}")
+        tell(min(1.0, seen_frames / expected), step=f"looking at {name}")
 
     detector = make_detector(model)
     try:
@@ -257,7 +261,7 @@ def _write_pictures(
     clip: Clip,
     track: _Track,
     cut_background: bool,
-    tell: Progress,
+    tell: Report,
     should_stop: ShouldStop | None,
 ) -> None:
     count = len(clip)
@@ -269,7 +273,7 @@ def _write_pictures(
             masks = np.empty((count, matte.MASK_SIDE, matte.MASK_SIDE), np.uint8)
             for row, picture in enumerate(_windows(track, work, should_stop)):
                 masks[row] = segmenter(picture)
-                tell(0.4 * row / count, f"cutting out {clip.name}")
+                tell(0.4 * row / count, step=f"cutting out {clip.name}")
         finally:
             segmenter.close()
         masks = matte.steadied(masks)
@@ -280,7 +284,7 @@ def _write_pictures(
             rgba = matte.cut_out(picture, masks[row])
         rgba = matte.shrink(rgba, clip.width)
         writer.image(clip.name, int(clip.frame_id[row]), (rgba * 255 + 0.5).astype(np.uint8))
-        tell(0.4 + 0.6 * row / count, f"writing {clip.name}")
+        tell(0.4 + 0.6 * row / count, step=f"writing {clip.name}")
 
 
 def _windows(track: _Track, side: int, should_stop: ShouldStop | None) -> Iterator[np.ndarray]:
