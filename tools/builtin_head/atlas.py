@@ -28,9 +28,9 @@ def build_atlas(
     cut: Cut, triangles: np.ndarray, uv_triangles: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
     """UVs [U,2], uv triangles [T,3], and the triangles (bool [T]) of each named island."""
-    raw = np.concatenate([cut.source.uvs, cut.eye.uvs, cut.eye.uvs * (-1, 1)])
+    raw = np.concatenate([cut.uvs, cut.eye.uvs, cut.eye.uvs * (-1, 1)])
     uv_triangles = uv_triangles.copy()
-    start = len(cut.source.uvs)
+    start = len(cut.uvs)
     for side in range(2):
         first = cut.eye_slice(side).start
         mine = (triangles >= first).all(1) & (triangles < cut.eye_slice(side).stop).all(1)
@@ -59,7 +59,7 @@ def _name_islands(
             triangles < cut.eye_slice(side).stop
         ).all(1)
     body = ~np.any(list(result.values()), axis=0)
-    rest = cut.rest()
+    rest = cut.rest
     for number in np.unique(label[body]):
         mask = body & (label == number)
         centre = rest[triangles[mask]].mean((0, 1))
@@ -78,7 +78,7 @@ def _name_islands(
 def _straighten(name: str, uv: np.ndarray) -> np.ndarray:
     """Turn an island upright; give the head island's middle (the face) more room."""
     if name == "helper-tongue":
-        return uv[:, ::-1]
+        return uv[:, ::-1] * (-1, 1)
     if name != "head":
         return uv
     # MakeHuman lays the face on its side, crown at low u

@@ -1,4 +1,4 @@
-"""The identity space: a population drawn from MakeHuman's sliders, then its principal components."""
+"""The identity space: people drawn from MakeHuman's sliders, and their principal components."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tools.builtin_head.cut import METRES, Cut
+from tools.builtin_head.cut import METRES, Cut, sphere_centre
 
 COMPONENTS = 64
 _PEOPLE = 6000
@@ -14,7 +14,9 @@ _RACES = ("african", "asian", "caucasian")
 _GENDERS = ("female", "male")
 _AGES = ("young", "old")
 _LEVELS = ("min", "average", "max")
-_FOLDERS = ("mouth", "nose", "eyebrows", "cheek", "head", "eyes", "forehead", "chin", "neck", "ears")
+_FOLDERS = (
+    "mouth", "nose", "eyebrows", "cheek", "head", "eyes", "forehead", "chin", "neck", "ears",
+)  # fmt: skip
 _OPPOSITES = (
     ("decr", "incr"), ("down", "up"), ("in", "out"), ("backward", "forward"),
     ("compress", "uncompress"), ("concave", "convex"),
@@ -22,8 +24,10 @@ _OPPOSITES = (
 # Moves of a whole part sideways, and of the head on the body: no trait of a face
 _DROPPED = ("head-trans", "mouth-trans-in", "mouth-trans-out", "nose-trans-in", "nose-trans-out",
             "neck-trans", "head-angle")  # fmt: skip
-_SPREAD = {"ears": 0.2, "neck": 0.2, "eyes": 0.25, "asym": 0.05}  # of slider values; 0.28 otherwise
-_EAR_AND_HEAD_STEREOTYPES = 0.18
+# Standard deviation of slider values by folder
+_SPREAD = {"ears": 0.18, "neck": 0.18, "eyes": 0.18, "nose": 0.2, "mouth": 0.2, "asym": 0.05}
+_USUAL_SPREAD = 0.23
+_ONE_SIDED_SPREAD = 0.15  # shapes without an opposite: round heads, pointed ears
 
 
 @dataclass(frozen=True)
@@ -77,7 +81,7 @@ def _detail_weights(cut: Cut, rng: np.random.Generator) -> dict[str, np.ndarray]
     result: dict[str, np.ndarray] = {}
     shared: dict[str, np.ndarray] = {}
     for folder in (*_FOLDERS, "asym"):
-        spread = _SPREAD.get(folder, 0.28)
+        spread = _SPREAD.get(folder, _USUAL_SPREAD)
         names = [
             name
             for name in cut.source.target_names(folder)
@@ -99,7 +103,7 @@ def _detail_weights(cut: Cut, rng: np.random.Generator) -> dict[str, np.ndarray]
             elif folder == "asym":
                 result[name] = np.maximum(value, 0)
             else:
-                result[name] = np.maximum(value, 0) / spread * _EAR_AND_HEAD_STEREOTYPES
+                result[name] = np.maximum(value, 0) / spread * _ONE_SIDED_SPREAD
     return result
 
 
@@ -109,7 +113,7 @@ def build_identity(cut: Cut) -> Identity:
     drawn = {**_macro_weights(rng), **_detail_weights(cut, rng)}
     weights = np.stack(list(drawn.values()), 1)  # [people, K]
     helpers = np.stack([cut.source.target(name) for name in drawn])  # [K,N,3]
-    vertices = np.stack([cut.displace(target) for target in helpers])  # [K,V,3]
+    vertices = np.stack([cut.displace(target, round_eyes=True) for target in helpers])  # [K,V,3]
     skull = _skull(cut)
     lift = vertices[:, skull].mean(1)[:, None]  # macros are bodies of other heights: the head moves
     vertices -= lift
@@ -124,10 +128,9 @@ def build_identity(cut: Cut) -> Identity:
     left, singular, _ = np.linalg.svd(weighted, full_matrices=False)
     combine = left[:, :COMPONENTS].T @ root  # [B,K]
     combine *= np.sign(combine.sum(1, keepdims=True))
-    template = cut.rest() + np.tensordot(mean, vertices, 1)
+    template = cut.rest + np.tensordot(mean, vertices, 1)
     helper_template = cut.source.vertices + np.tensordot(mean, helpers, 1)
-    eyes = [template[cut.eye_slice(side)] for side in range(2)]
-    centres = [(e.max(0) + e.min(0)) / 2 for e in eyes]
+    centres = [sphere_centre(template[cut.eye_slice(side)]) for side in range(2)]
     origin = (centres[0] + centres[1]) / 2
     origin[0] = 0.0
     energy = float((singular[:COMPONENTS] ** 2).sum() / (singular**2).sum())
@@ -142,12 +145,12 @@ def build_identity(cut: Cut) -> Identity:
 
 def _skull(cut: Cut) -> np.ndarray:
     """bool [V]: bone vertices of MakeHuman's head bone above the mouth."""
-    rest = cut.rest()
+    rest = cut.rest
     head = cut.bone(cut.source.bone_weights["head"]) > 0.9
     return head & (rest[:, 1] > 6.9)
 
 
 def _importance(cut: Cut, vertices: np.ndarray) -> np.ndarray:
     """Weight [V] of a vertex's variance: faces count, torsos barely."""
-    height = cut.rest()[:, 1]
+    height = cut.rest[:, 1]
     return 0.1 + 0.9 / (1 + np.exp(-(height - 6.1) / 0.15))

@@ -126,7 +126,7 @@ def _from_own_side(votes: np.ndarray, side: float) -> np.ndarray:
 
 
 def _median(votes: np.ndarray) -> np.ndarray:
-    """Weighted geometric median [2] of votes [n,4] (u, v, weight, ...), by Weiszfeld's iteration."""
+    """Weighted geometric median [2] of votes [n,4] (u, v, weight, _), by Weiszfeld's iteration."""
     points, weights = votes[:, :2], votes[:, 2]
     centre = np.average(points, axis=0, weights=weights)
     for _ in range(60):
@@ -152,12 +152,13 @@ def _symmetrise(head, uv, mirror, partners, candidates) -> np.ndarray:
     atlas = np.zeros((len(head.template), 2))
     atlas[head.triangles[candidates]] = head.uvs[head.uv_triangles[candidates]]
     image = (atlas[mirror[head.triangles[triangles]]] * blend[..., None]).sum(1)
-    print(f"landmarks: two sides differ by {np.linalg.norm(uv - image[partners], axis=1).max():.4f}")
+    differ = np.linalg.norm(uv - image[partners], axis=1).max()
+    print(f"landmarks: the two sides differ by up to {differ:.4f} of the atlas")
     return 0.5 * (uv + image[partners])
 
 
 def _locate(head, uv, candidates) -> tuple[np.ndarray, np.ndarray]:
-    """Triangle [n] and barycentrics [n,3] of places in the atlas [n,2], the nearest where outside."""
+    """Triangle [n] and barycentrics [n,3] nearest to places in the atlas [n,2]."""
     corners = head.uvs[head.uv_triangles[candidates]].astype(np.float64)  # [k,3,2]
     a, ab, ac = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     area = ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]

@@ -80,9 +80,10 @@ class MakeHuman:
     @cached_property
     def face_units(self) -> dict[str, np.ndarray]:
         """The 52 ARKit-named expressions: name -> displacements [N,3]."""
-        names = sorted(n for n in self._names if n.startswith(_FACE_UNITS) and n.endswith(".target"))
+        found = (n for n in self._names if n.startswith(_FACE_UNITS) and n.endswith(".target"))
         return {
-            Path(name).stem: self._displacements(self._zip.read(name).decode()) for name in names
+            Path(name).stem: self._displacements(self._zip.read(name).decode())
+            for name in sorted(found)
         }
 
     def _displacements(self, text: str) -> np.ndarray:
@@ -111,7 +112,7 @@ class MakeHuman:
 
     @cached_property
     def mirror(self) -> np.ndarray:
-        """Index [N] of each vertex's mirror image in the x = 0 plane (nearest, exact in practice)."""
+        """Index [N] of the vertex nearest to each vertex's mirror image in the plane x = 0."""
         from scipy.spatial import cKDTree
 
         tree = cKDTree(self.vertices)

@@ -58,10 +58,10 @@ def rasterise(points, triangles, size):  # pragma: no cover - compiled
         area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
         if abs(area) < 1e-12:
             continue
-        x0 = max(int(math.floor(min(a[0], b[0], c[0]) - 0.5)), 0)
-        x1 = min(int(math.ceil(max(a[0], b[0], c[0]) + 0.5)), size)
-        y0 = max(int(math.floor(min(a[1], b[1], c[1]) - 0.5)), 0)
-        y1 = min(int(math.ceil(max(a[1], b[1], c[1]) + 0.5)), size)
+        x0 = max(math.floor(min(a[0], b[0], c[0]) - 0.5), 0)
+        x1 = min(math.ceil(max(a[0], b[0], c[0]) + 0.5), size)
+        y0 = max(math.floor(min(a[1], b[1], c[1]) - 0.5), 0)
+        y1 = min(math.ceil(max(a[1], b[1], c[1]) + 0.5), size)
         for y in range(y0, y1):
             for x in range(x0, x1):
                 px, py = x + 0.5, y + 0.5

@@ -8,6 +8,7 @@ from tools.builtin_head.cut import Cut
 from tools.builtin_head.rig import Rig
 
 _EYE_REACH = 0.021  # metres from an eye's centre, seen from the front
+_NECK_TOP = -0.05  # metres below the eyes: the hairline at the nape
 
 
 def build_regions(
@@ -24,15 +25,17 @@ def build_regions(
     head = of_island("head")
     sockets = of_island("left_socket", "right_socket") & ~head
     mouth = of_island("mouth") & ~head
+    mouth_rim = of_island("mouth") & head
     painted = {name: _painted(cut, name, head) for name in ("face", "lips", "ears")}
+    painted = {name: mask | mask[cut.mirror] for name, mask in painted.items()}
     neck_share = rig.weights[:, 1] + rig.weights[:, 2]
     face = painted["face"] & ~painted["ears"]
     skin = head & ~painted["ears"]
-    below = (neck_share < 0.97) | (template[:, 1] < -0.095)
+    below = template[:, 1] < _NECK_TOP
     neck = (skin | of_island("torso")) & ~face & below & (neck_share > 0.08)
     regions = {
         "face": face,
-        "lips": painted["lips"],
+        "lips": painted["lips"] | mouth_rim,
         "ears": painted["ears"],
         "neck": neck,
         "scalp": skin & ~face & ~neck,
@@ -59,5 +62,5 @@ def _painted(cut: Cut, name: str, allowed: np.ndarray) -> np.ndarray:
     column = np.clip((uv[:, 0] * width).astype(int), 0, width - 1)
     row = np.clip(((1 - uv[:, 1]) * height).astype(int), 0, height - 1)
     mask = np.zeros(len(allowed), bool)
-    mask[corners[picture[row, column] > 0.5]] = True
+    mask[corners[(picture[row, column] > 0.5) & (corners >= 0)]] = True
     return mask & allowed

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
-from tools.builtin_head.cut import METRES, Cut
+from tools.builtin_head.cut import METRES, Cut, sphere_centre
 from tools.builtin_head.identity import Identity
 
 JOINTS = ("root", "neck", "jaw", "left_eye", "right_eye")
@@ -38,12 +38,14 @@ def build_rig(cut: Cut, identity: Identity, triangles: np.ndarray) -> Rig:
     return Rig(_regressor(cut, identity, triangles), weights)
 
 
-def _hinge(cut: Cut) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation [3,3] and pivot [3] (decimetres) of the lower teeth in the jawOpen target."""
-    source = cut.source
-    teeth = source.group_vertices("helper-lower-teeth")
-    before = source.vertices[teeth]
-    after = before + source.face_units["jawOpen"][teeth]
+def _hinge(cut: Cut, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation [3,3] and pivot [3] of the lower teeth in the jawOpen target.
+
+    positions: [V,3] decimetres; the target's displacements are added to them.
+    """
+    teeth = cut.members("helper-lower-teeth")
+    before = positions[teeth]
+    after = before + cut.displace(cut.source.face_units["jawOpen"])[teeth]
     u, _, vt = np.linalg.svd((before - before.mean(0)).T @ (after - after.mean(0)))
     rotation = (u @ vt).T
     shift = after.mean(0) - rotation @ before.mean(0)
@@ -54,8 +56,8 @@ def _hinge(cut: Cut) -> tuple[np.ndarray, np.ndarray]:
 
 def _jaw_weights(cut: Cut) -> np.ndarray:
     """How far each vertex [V] follows the lower teeth when the jawOpen target opens the mouth."""
-    rotation, pivot = _hinge(cut)
-    rest = cut.rest()
+    rest = cut.rest
+    rotation, pivot = _hinge(cut, rest)
     rigid = (rest - pivot) @ (rotation - np.eye(3)).T
     moved = cut.displace(cut.source.face_units["jawOpen"])
     share = (moved * rigid).sum(1) / np.maximum((rigid**2).sum(1), 1e-6)
@@ -109,9 +111,9 @@ def _regressor(cut: Cut, identity: Identity, triangles: np.ndarray) -> np.ndarra
 
     base, top = cube("joint-neck"), cube("joint-head")
     neck = tuple((1 - _NECK_PLACE) * a + _NECK_PLACE * b for a, b in zip(base, top, strict=True))
-    mouth_rest = source.vertices[source.group_vertices("joint-mouth")].mean(0)
-    mouth = cube("joint-mouth")
-    jaw = (mouth[0] + METRES * (_hinge(cut)[1] - mouth_rest), mouth[1])
+    # the hinge goes with the lower teeth, so that the joint and the jawOpen target agree
+    pivot = METRES * _hinge(cut, identity.template / METRES)[1]
+    jaw = (pivot, identity.basis[:, cut.members("helper-lower-teeth")].mean(1))
     body = np.ones(cut.vertex_count, bool)
     for group in ("helper-upper-teeth", "helper-lower-teeth", "helper-tongue"):
         body &= ~cut.members(group)
@@ -122,33 +124,34 @@ def _regressor(cut: Cut, identity: Identity, triangles: np.ndarray) -> np.ndarra
         distance = np.abs(identity.template[:, 1:] - place[1:])
         near = body & (np.linalg.norm(distance, axis=1) < 2.2 * _REACH)
         rows.append(_affine_mean(identity, near, place, moves))
+    rows = [0.5 * (row + row[cut.mirror]) for row in rows]
     for side in range(2):
         mask = np.zeros(cut.vertex_count, bool)
         mask[cut.eye_slice(side)] = True
-        name = f"joint-{'lr'[side]}-eye"
-        place, moves = cube(name)
-        rows.append(_affine_mean(identity, mask, place, moves))
-    rows[:3] = [0.5 * (row + row[cut.mirror]) for row in rows[:3]]
+        # an affine mean that is the centre of a sphere stays it when the sphere moves and grows
+        rows.append(_affine_mean(identity, mask, sphere_centre(identity.template[mask]), None))
     return np.array(rows)
 
 
 def _affine_mean(
-    identity: Identity, candidates: np.ndarray, place: np.ndarray, moves: np.ndarray
+    identity: Identity, candidates: np.ndarray, place: np.ndarray, moves: np.ndarray | None
 ) -> np.ndarray:
-    """Weights [V] summing to 1 whose mean is ``place`` [3] and moves by ``moves`` [B,3].
+    """Small weights [V] summing to 1 whose mean is ``place`` [3] and moves by ``moves`` [B,3].
 
-    Ridge least squares for the moves under exact constraints for the place and the sum.
+    Ridge least squares for the moves, if any, under exact constraints for the place and the sum.
     """
     index = np.flatnonzero(candidates)
     points = identity.template[index]
-    basis = identity.basis[:, index]  # [B,n,3]
-    design = np.moveaxis(basis, 1, 2).reshape(-1, len(index)) * 1000  # millimetres
-    goal = moves.reshape(-1) * 1000
+    gram, goal = np.eye(len(index)), np.zeros(len(index))
+    if moves is not None:
+        basis = identity.basis[:, index]  # [B,n,3]
+        design = np.moveaxis(basis, 1, 2).reshape(-1, len(index)) * 1000  # millimetres
+        gram = design.T @ design + 20.0 * gram
+        goal = design.T @ moves.reshape(-1) * 1000
     constraints = np.vstack([np.ones(len(index)), (points - place).T * 100])
     values = np.array([1.0, 0.0, 0.0, 0.0])
-    gram = design.T @ design + 20.0 * np.eye(len(index))
     system = np.block([[gram, constraints.T], [constraints, np.zeros((4, 4))]])
-    solution = np.linalg.lstsq(system, np.concatenate([design.T @ goal, values]), rcond=None)[0]
+    solution = np.linalg.lstsq(system, np.concatenate([goal, values]), rcond=None)[0]
     row = np.zeros(len(candidates))
     row[index] = solution[: len(index)]
     return row

@@ -3,5 +3,14 @@
 from .builtin import BUILTIN, builtin_head, load_head
 from .files import read_head, write_head
 from .model import HeadModel
+from .shape_keys import head_from_shape_keys
 
-__all__ = ["BUILTIN", "HeadModel", "builtin_head", "load_head", "read_head", "write_head"]
+__all__ = [
+    "BUILTIN",
+    "HeadModel",
+    "builtin_head",
+    "head_from_shape_keys",
+    "load_head",
+    "read_head",
+    "write_head",
+]

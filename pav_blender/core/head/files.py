@@ -11,6 +11,7 @@ import tempfile
 import zipfile
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -94,17 +95,16 @@ def _assemble(path: Path, content: dict[str, np.ndarray]) -> HeadModel:
         if name + "_step" in content:
             step = np.float32(content[name + "_step"])
             content[name] = content[name].astype(np.float32) * step
+    values: dict[str, Any] = {name: content[name] for name in _ARRAYS}
+    values |= {name: str(content[name]) for name in _STRINGS}
+    values |= {name: tuple(content[name].ravel().tolist()) for name in _NAMES}
+    values["regions"] = {
+        name.removeprefix(_REGION): mask
+        for name, mask in content.items()
+        if name.startswith(_REGION)
+    }
     try:
-        return HeadModel(
-            **{name: str(content[name]) for name in _STRINGS},
-            **{name: tuple(content[name].ravel().tolist()) for name in _NAMES},
-            **{name: content[name] for name in _ARRAYS},
-            regions={
-                name.removeprefix(_REGION): mask
-                for name, mask in content.items()
-                if name.startswith(_REGION)
-            },
-        )
+        return HeadModel(**values)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 
@@ -112,5 +112,6 @@ def _assemble(path: Path, content: dict[str, np.ndarray]) -> HeadModel:
 def _quantise(name: str, basis: np.ndarray, step: float) -> np.ndarray:
     counts = np.round(basis / np.float32(step))
     if counts.size and np.abs(counts).max() > np.iinfo(np.int16).max:
-        raise InputError(f"{name} reaches {np.abs(basis).max():.3g} m, too far for a step of {step}")
+        reach = np.abs(basis).max()
+        raise InputError(f"{name} reaches {reach:.3g} m, too far for a step of {step}")
     return counts.astype(np.int16)

@@ -23,7 +23,7 @@ import torch
 from ..errors import InputError
 from .skinning import pose_vertices
 
-CANONICAL_JAW_DEGREES = 12.0  # INSTA's canonical space: lips apart, so that they do not share points
+CANONICAL_JAW_DEGREES = 12.0  # INSTA's canonical space: the lips do not touch
 _BASES = ("shape_basis", "expression_basis", "pose_basis")
 
 
@@ -85,7 +85,7 @@ class HeadModel:
         dtype = torch.float64 if double else torch.float32
         device = pose.device if torch.is_tensor(pose) else torch.device("cpu")
         betas, expression, pose, translation = (
-            torch.as_tensor(a, dtype=dtype, device=device) for a in arguments
+            _tensor(argument, device, dtype) for argument in arguments
         )
         self._check_parameters(betas.shape, expression.shape, pose.shape, translation.shape)
         return pose_vertices(self._tensors(device, dtype), betas, expression, pose, translation)
@@ -116,8 +116,8 @@ class HeadModel:
         """Landmark positions [...,L,3] on vertices [...,V,3] (array or tensor, differentiable)."""
         corners = self.triangles[self.landmark_triangles]
         if torch.is_tensor(vertices):
-            index = torch.as_tensor(corners, dtype=torch.long, device=vertices.device)
-            weights = torch.as_tensor(self.landmark_barycentrics).to(vertices)
+            index = torch.tensor(corners, dtype=torch.long, device=vertices.device)
+            weights = torch.tensor(self.landmark_barycentrics).to(vertices)
             return (vertices[..., index, :] * weights[..., None]).sum(-2)
         return (vertices[..., corners, :] * self.landmark_barycentrics[..., None]).sum(-2)
 
@@ -173,11 +173,17 @@ _POSED = ("template", *_BASES, "joint_regressor", "skinning_weights")
 
 
 def _freeze(head: HeadModel, field: str, dtype: type) -> None:
-    array = np.ascontiguousarray(getattr(head, field), dtype)
+    array: np.ndarray = np.ascontiguousarray(getattr(head, field), dtype)
     if array.flags.writeable:
         array = array.copy() if array is getattr(head, field) else array
         array.flags.writeable = False
     object.__setattr__(head, field, array)
+
+
+def _tensor(values, device: torch.device, dtype: torch.dtype) -> torch.Tensor:
+    if torch.is_tensor(values):
+        return values.to(device, dtype)
+    return torch.tensor(np.asarray(values), dtype=dtype, device=device)
 
 
 def _vector(values, count: int, what: str) -> np.ndarray:

@@ -19,7 +19,7 @@ def rotation_matrix(rotation: np.ndarray) -> np.ndarray:
 
 
 def pose(head: HeadModel, betas, expression, pose, translation) -> np.ndarray:
-    """Vertices [V,3] float64 of one frame: betas [B], expression [E], pose [J,3], translation [3]."""
+    """One frame: betas [B], expression [E], pose [J,3], translation [3] -> [V,3] float64."""
     shaped = head.template.astype(np.float64)
     for value, direction in zip(np.asarray(betas, np.float64), head.shape_basis, strict=False):
         shaped = shaped + value * direction.astype(np.float64)

@@ -67,14 +67,14 @@ def pose_vertices(
 def _blend(coefficients: torch.Tensor, basis: torch.Tensor) -> torch.Tensor:
     """[..., K] and [>=K,V,3] -> [...,V,3]."""
     used = basis[: coefficients.shape[-1]]
-    flat = coefficients @ used.reshape(len(used), -1)
+    flat = coefficients @ used.reshape(len(used), 3 * basis.shape[1])
     return flat.reshape(*coefficients.shape[:-1], *basis.shape[1:])
 
 
 def _joint_motions(
     rotations: torch.Tensor, joints: torch.Tensor, parents: list[int]
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Rest-to-posed motion of each joint: turns [F,J,3,3] and shifts [F,J,3], x -> turn x + shift."""
+    """Rest-to-posed motions x -> turn x + shift: turns [F,J,3,3] and shifts [F,J,3]."""
     turns = [rotations[:, 0]]
     places = [joints[:, 0]]
     for joint, parent in enumerate(parents[1:], start=1):
