@@ -18,6 +18,8 @@ from .landmark_model import LandmarkModel, axis_angles, rotations
 from .observe import Observations
 
 _CHUNK = 32
+# identity and lens are found on so many frames of each clip, then all frames follow
+_COARSE_FRAMES, _COARSE_STEPS, _FINE_STEPS = 40, 10, 5
 _FOREHEAD, _CHIN = 10, 152
 _LEFT_PUPIL, _RIGHT_PUPIL = 473, 468
 
@@ -63,7 +65,6 @@ def fit_head(
     seen: list[Observations],
     *,
     shapes: int = 60,
-    iterations: int = 12,
     progress: Callable[[float], None] | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> HeadFit:
@@ -74,16 +75,58 @@ def fit_head(
     """
     model = LandmarkModel(head, shapes)
     prior = priors.frame_prior(head)
-    data = [_prepare(head, clip, prior) for clip in seen]
-    betas = np.zeros(model.shapes)
-    clips = [
-        _first_guess(model, clip, observations)
-        for clip, observations in zip(data, seen, strict=True)
-    ]
+    state = _State(np.zeros(model.shapes), [])
+    sparse = [np.arange(0, len(clip), -(-len(clip) // _COARSE_FRAMES)) for clip in seen]
+    coarse = [clip.subset(rows) for clip, rows in zip(seen, sparse, strict=True)]
+    data = [_prepare(head, clip, prior, steady=False) for clip in coarse]
+    for clip, observed in zip(data, coarse, strict=True):
+        state.clips.append(_first_guess(model, clip, observed))
+    tell = progress or (lambda fraction: None)
+    share = sum(map(len, sparse)) / (sum(map(len, sparse)) + sum(map(len, seen)))
+    state = _descend(
+        model, prior, data, state, _COARSE_STEPS, lambda done: tell(share * done), should_stop
+    )
+    guesses = [clip.focal for clip in data]
+    data = [_prepare(head, clip, prior, steady=True) for clip in seen]
+    for index, clip in enumerate(data):
+        clip.focal = guesses[index]
+        state.clips[index] = _filled_in(state.clips[index], sparse[index], len(clip.target))
+    state = _descend(
+        model, prior, data, state, _FINE_STEPS,
+        lambda done: tell(share + (1 - share) * done), should_stop,
+    )  # fmt: skip
+    betas, clips = state.betas, state.clips
+    if not np.isfinite(betas).all():
+        raise PavError("the head fit diverged; leave out the clip that shows the face least")
+    return HeadFit(
+        betas,
+        clips,
+        [errors(model, betas, fit, clip.target) for clip, fit in zip(data, clips, strict=True)],
+        [_eye_distance(clip) for clip in seen],
+    )
+
+
+@dataclass(eq=False)
+class _State:
+    betas: np.ndarray
+    clips: list[ClipFit]
+
+
+def _descend(
+    model: LandmarkModel,
+    prior: priors.FramePrior,
+    data: list[_Clip],
+    state: _State,
+    steps: int,
+    tell: Callable[[float], None],
+    should_stop: Callable[[], bool] | None,
+) -> _State:
+    """Levenberg-Marquardt; the landmarks' weights are found anew for every step."""
     damping, previous = 1e-3, np.inf
-    for step in range(iterations):
+    for step in range(steps):
         if should_stop is not None and should_stop():
             raise Cancelled("tracking stopped; nothing was written")
+        betas, clips = state.betas, state.clips
         weights = [_weights(model, betas, clip, fit) for clip, fit in zip(data, clips, strict=True)]
         before = _cost(model, prior, data, weights, betas, clips)
         normals = [
@@ -95,24 +138,30 @@ def fit_head(
             candidate = _stepped(normals, damping, betas, clips)
             after = _cost(model, prior, data, weights, *candidate)
             if after < before:
-                betas, clips = candidate
+                state = _State(*candidate)
                 damping = max(damping * 0.3, 1e-7)
                 break
             damping *= 6
         else:
             break
-        if progress is not None:
-            progress((step + 1) / iterations)
+        tell((step + 1) / steps)
         if abs(before - after) < 1e-3 * before and abs(previous - before) < 5e-3 * before:
             break
         previous = before
-    if not np.isfinite(betas).all():
-        raise PavError("the head fit diverged; leave out the clip that shows the face least")
-    return HeadFit(
-        betas,
-        clips,
-        [errors(model, betas, fit, clip.target) for clip, fit in zip(data, clips, strict=True)],
-        [_eye_distance(clip) for clip in seen],
+    return state
+
+
+def _filled_in(fit: ClipFit, rows: np.ndarray, frames: int) -> ClipFit:
+    """A fit of some rows carried on to all frames, linearly between."""
+
+    def carried(values: np.ndarray) -> np.ndarray:
+        flat = values.reshape(len(rows), -1)
+        every = np.arange(frames)
+        columns = [np.interp(every, rows, column) for column in flat.T]
+        return np.stack(columns, 1).reshape(frames, *values.shape[1:])
+
+    return ClipFit(
+        fit.focal, fit.root, carried(fit.pose), carried(fit.translation), carried(fit.expression)
     )
 
 
@@ -121,7 +170,9 @@ def _eye_distance(seen: Observations) -> float:
     return float(np.median(np.linalg.norm(apart, axis=1)))
 
 
-def _prepare(head: HeadModel, seen: Observations, prior: priors.FramePrior) -> _Clip:
+def _prepare(
+    head: HeadModel, seen: Observations, prior: priors.FramePrior, *, steady: bool
+) -> _Clip:
     middle = np.array([seen.width / 2, seen.height / 2])
     target = seen.landmarks[..., :2].astype(np.float64) - middle
     face = float(np.median(np.linalg.norm(target[:, _CHIN] - target[:, _FOREHEAD], axis=1)))
@@ -137,7 +188,7 @@ def _prepare(head: HeadModel, seen: Observations, prior: priors.FramePrior) -> _
     ids = seen.frame_id.astype(np.int64)
     gaps = np.diff(ids)
     usual = int(np.median(gaps)) if len(gaps) else 1
-    even = (gaps[:-1] == usual) & (gaps[1:] == usual) if len(gaps) > 1 else np.zeros(0, bool)
+    even = (gaps[:-1] == usual) & (gaps[1:] == usual) & steady
     return _Clip(
         target,
         priors.iris_trust(seen.landmarks) * priors.landmark_weights() * priors.INDEPENDENT,
@@ -151,7 +202,7 @@ def _prepare(head: HeadModel, seen: Observations, prior: priors.FramePrior) -> _
 
 def _first_guess(model: LandmarkModel, clip: _Clip, seen: Observations) -> ClipFit:
     """Each frame's turn and distance from the detector's own depth, by Procrustes' method."""
-    rest = model.rest.sum(axis=1)
+    rest = model.rest.sum(axis=0).T
     use = np.flatnonzero(priors.landmark_weights() >= 0.5)[:]
     source = rest[use] - rest[use].mean(axis=0)
     points = np.concatenate([clip.target, seen.landmarks[..., 2:].astype(np.float64)], axis=2)
@@ -293,18 +344,18 @@ def _normal(
     common_gradient = np.zeros(shared)
     for start in range(0, frames, _CHUNK):
         rows = slice(start, start + _CHUNK)
-        residual, jacobian, borders = _linearised(model, clip, fit, rows, betas)
-        root = np.sqrt(weight[rows]).repeat(2, axis=1)
-        residual = residual * root
-        jacobian *= root[..., None]
-        borders *= root[..., None]
-        transposed = jacobian.transpose(0, 2, 1)
-        own[rows] = transposed @ jacobian
-        border[rows, :, columns] = transposed @ borders
-        gradient[rows] = (transposed @ residual[..., None])[..., 0]
-        flat = borders.reshape(-1, len(columns))
-        common[np.ix_(columns, columns)] += flat.T @ flat
-        common_gradient[columns] += flat.T @ residual.reshape(-1)
+        residual, slopes = _linearised(model, clip, fit, rows, betas)
+        root = np.sqrt(weight[rows])[:, None, None].astype(np.float32)
+        slopes *= root
+        slopes = slopes.reshape(*slopes.shape[:2], -1)
+        residual = (residual * root[:, 0]).reshape(len(slopes), -1, 1)
+        product = (slopes @ slopes.transpose(0, 2, 1)).astype(np.float64)
+        pull = (slopes @ residual)[..., 0].astype(np.float64)
+        own[rows] = product[:, :size, :size]
+        border[rows, :, columns] = product[:, :size, size:]
+        gradient[rows] = pull[:, :size]
+        common[np.ix_(columns, columns)] += product[:, size:, size:].sum(axis=0)
+        common_gradient[columns] += pull[:, size:].sum(axis=0)
     over = values - values.clip(prior.low, prior.high)
     diagonal = np.arange(size)
     own[:, diagonal, diagonal] += clip.weight + prior.wall * (over != 0)
@@ -330,28 +381,19 @@ def _normal(
 
 def _linearised(
     model: LandmarkModel, clip: _Clip, fit: ClipFit, rows: slice, betas: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Residuals [f,2L] in pixels and their derivatives by a frame's and by the shared unknowns."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals [f,2,L] in pixels and their derivatives [f, n + B + 4, 2, L] by a frame's unknowns
+    and the shared ones (identity, log focal, root), float32."""
     pose = fit.pose[rows]
     posed = model.pose(betas, fit.expression[rows], pose, fit.translation[rows])
     pixels = _project(posed.points, fit.focal)
     slopes = model.jacobian(posed, pose, _outer(posed.points, fit.focal))
     frames, count = posed.points.shape[:2]
-    own = np.concatenate(
-        [
-            slopes.pose[..., 1:, :].reshape(frames, count, 2, -1),
-            slopes.translation,
-            slopes.expression,
-        ],
-        axis=3,
-    )
-    borders = np.concatenate([slopes.shape, pixels[..., None], slopes.pose[..., 0, :]], axis=3)
-    residual = (pixels - clip.target[rows]).reshape(frames, -1)
-    return (
-        residual,
-        own.reshape(frames, 2 * count, -1),
-        borders.reshape(frames, 2 * count, -1),
-    )
+    turns = slopes.pose.reshape(frames, -1, 2, count)
+    by_focal = pixels.transpose(0, 2, 1)[:, None].astype(np.float32)
+    parts = (turns[:, 3:], slopes.translation, slopes.expression, slopes.shape, by_focal)
+    residual = (pixels - clip.target[rows]).transpose(0, 2, 1).astype(np.float32)
+    return residual, np.concatenate([*parts, turns[:, :3]], axis=1)
 
 
 def _add_shared_priors(

@@ -34,10 +34,10 @@ RIGHT_OPENING, LEFT_OPENING = (159, 145, 33, 133), (386, 374, 263, 362)
 
 @dataclass(eq=False)
 class Posed:
-    """points [F,L,3] metres; what `LandmarkModel.jacobian` needs to go on."""
+    """points [F,L,3] metres; and what `LandmarkModel.jacobian` needs to go on."""
 
     points: np.ndarray
-    parts: np.ndarray  # [F,L,J,3]: each joint's share of a point, translation left out
+    parts: np.ndarray  # [F,J,3,L]: each joint's share of a point, translation left out
     turns: np.ndarray  # [F,J,3,3] joints' rotations in the world
     places: np.ndarray  # [F,J,3] joints' positions, translation left out
     local: np.ndarray  # [F,J,3,3] joints' own rotations
@@ -69,9 +69,10 @@ class LandmarkModel:
                 head.pose_basis[:, corners],
             ]
         ).astype(np.float64)  # [K,L,3,3]
-        self.share = skin.sum(axis=1)  # [L,J]
-        self.rest = np.einsum("lvj,lvx->ljx", skin, head.template[corners].astype(np.float64))
-        self.basis = np.einsum("lvj,klvx->ljxk", skin, bases, optimize=True)  # [L,J,3,K]
+        self.share = np.ascontiguousarray(skin.sum(axis=1).T)  # [J,L]
+        rest = head.template[corners].astype(np.float64)
+        self.rest = np.einsum("lvj,lvx->jxl", skin, rest)
+        self.basis = np.einsum("lvj,klvx->kjxl", skin, bases, optimize=True)  # [K,J,3,L]
         regressor = head.joint_regressor.astype(np.float64)
         self.joint_rest = regressor @ head.template
         self.joint_basis = np.einsum(
@@ -100,10 +101,17 @@ class LandmarkModel:
     @cached_property
     def growth(self) -> np.ndarray:
         """Relative growth of the face by one unit of each identity component, [shapes]."""
-        rest = self.rest.sum(axis=1)
-        rest = rest - rest.mean(axis=0)
-        basis = self.basis[..., : self.shapes].sum(axis=1)
-        return np.einsum("lx,lxb->b", rest, basis) / (rest**2).sum()
+        rest = self.rest.sum(axis=0)
+        rest = rest - rest.mean(axis=1, keepdims=True)
+        basis = self.basis[: self.shapes].sum(axis=1)
+        return np.einsum("xl,bxl->b", rest, basis) / (rest**2).sum()
+
+    @cached_property
+    def _by_landmark(self) -> np.ndarray:
+        """The bases as [L, J*3, K] float32: derivatives do not need more."""
+        count = self.basis.shape[-1]
+        by_landmark = self.basis.transpose(3, 1, 2, 0).reshape(count, 3 * self.joints, -1)
+        return np.ascontiguousarray(by_landmark, np.float32)
 
     def pose(
         self,
@@ -125,64 +133,65 @@ class LandmarkModel:
         coefficients = [np.broadcast_to(betas, (frames, self.shapes)), expression]
         if self.correctives:
             coefficients.append((local[:, 1:] - np.eye(3)).reshape(frames, -1))
-        own = self.rest + np.tensordot(np.concatenate(coefficients, 1), self.basis, (1, 3))
+        known = np.concatenate(coefficients, 1)
+        own = known @ self.basis.reshape(len(self.basis), -1)
+        own = own.reshape(frames, *self.rest.shape) + self.rest
         shift = place - (turn @ joints[..., None])[..., 0]
-        parts = np.einsum("fjxy,fljy->fljx", turn, own, optimize=True)
-        parts += self.share[..., None] * shift[:, None]
-        points = parts.sum(axis=2) + translation[:, None]
+        parts = turn @ own + shift[..., None] * self.share[:, None]
+        points = parts.sum(axis=1).transpose(0, 2, 1) + translation[:, None]
         return Posed(points, parts, turn, place, local)
 
-    def jacobian(self, posed: Posed, pose: np.ndarray, outer: np.ndarray) -> _Jacobian:
-        """Derivatives of `outer @ point`, outer [F,L,D,3] (a projection's own derivative).
-
-        Returns shape [F,L,D,shapes], expression [F,L,D,E], pose [F,L,D,J,3] (axis-angle),
-        translation [F,L,D,3].
-        """
+    def jacobian(self, posed: Posed, pose: np.ndarray, outer: np.ndarray) -> Jacobian:
+        """Derivatives of `outer @ point`, outer [F,L,D,3] (a projection's own derivative)."""
+        outer = outer.astype(np.float32)
         frames, count, rows = outer.shape[:3]
-        turned = np.einsum("fldx,fjxy->lfdjy", outer, posed.turns, optimize=True)
-        flat = turned.reshape(count, frames * rows, self.joints * 3)
-        linear = flat @ self.basis.reshape(count, self.joints * 3, -1)
-        linear = linear.reshape(count, frames, rows, -1).transpose(1, 0, 2, 3)
-        shape = linear[..., : self.shapes]
-        shape = shape + self._joint_effect(posed, outer)
-        expression = linear[..., self.shapes : self.shapes + self.expressions]
+        turns = posed.turns.astype(np.float32).transpose(0, 2, 1, 3).reshape(frames, 3, -1)
+        turned = (outer.reshape(frames, count * rows, 3) @ turns).reshape(frames, count, rows, -1)
+        linear = turned.transpose(1, 0, 2, 3).reshape(count, frames * rows, -1) @ self._by_landmark
+        linear = linear.reshape(count, frames, rows, -1).transpose(1, 3, 2, 0)
+        outer = np.ascontiguousarray(outer.transpose(0, 2, 3, 1))  # [F,D,3,L]
+        shape = linear[:, : self.shapes] + self._joint_effect(posed, outer)
+        expression = linear[:, self.shapes : self.shapes + self.expressions]
         swings = rotation_derivatives(pose, posed.local)  # [F,J,3(k),3,3]
-        columns = np.empty((frames, count, rows, self.joints, 3))
+        columns = np.empty((frames, self.joints, 3, rows, count), np.float32)
         for joint in range(self.joints):
             parent = self.parents[joint]
-            before = posed.turns[:, parent] if parent >= 0 else np.eye(3)[None]
-            spin = np.einsum(
-                "fab,fkbc,fdc->fkad", before, swings[:, joint], posed.turns[:, joint], optimize=True
+            before = (
+                posed.turns[:, parent] if parent >= 0 else np.broadcast_to(np.eye(3), (1, 3, 3))
             )
+            back = posed.turns[:, joint].transpose(0, 2, 1)
+            spin = before[:, None] @ swings[:, joint] @ back[:, None]  # [F,3(k),3,3]
             below = self.subtree[joint]
-            lever = posed.parts[:, :, below].sum(axis=2)
-            lever -= self.share[:, below].sum(axis=1)[:, None] * posed.places[:, None, joint]
-            columns[..., joint, :] = np.einsum(
-                "fldx,fkxy,fly->fldk", outer, spin, lever, optimize=True
-            )
+            lever = posed.parts[:, below].sum(axis=1)
+            lever -= self.share[below].sum(axis=0) * posed.places[:, joint, :, None]
+            swept = (spin @ lever[:, None]).astype(np.float32)  # [F,3(k),3,L]
+            columns[:, joint] = (outer[:, None] * swept[:, :, None]).sum(axis=3)
             if self.correctives and joint > 0:
                 first = self.shapes + self.expressions + 9 * (joint - 1)
-                columns[..., joint, :] += np.einsum(
-                    "fldc,fkc->fldk",
-                    linear[..., first : first + 9],
-                    swings[:, joint].reshape(frames, 3, 9),
-                )
-        return _Jacobian(shape, expression, columns, outer)
+                bent = linear[:, first : first + 9].reshape(frames, 9, -1)
+                swung = swings[:, joint].reshape(frames, 3, 9).astype(np.float32)
+                columns[:, joint] += (swung @ bent).reshape(frames, 3, rows, count)
+        return Jacobian(shape, expression, columns, outer.transpose(0, 2, 1, 3))
 
     def _joint_effect(self, posed: Posed, outer: np.ndarray) -> np.ndarray:
-        """How identity moves landmarks by moving the joints they turn about."""
+        """How identity moves landmarks by moving the joints they turn about, [F,B,D,L]."""
         moved = [np.broadcast_to(self.joint_basis[0], (len(outer), *self.joint_basis[0].shape))]
         for joint in range(1, self.joints):
             parent = self.parents[joint]
             bone = self.joint_basis[joint] - self.joint_basis[parent]
             moved.append(moved[parent] + posed.turns[:, parent] @ bone)
         shift = np.stack(moved, 1) - posed.turns @ self.joint_basis  # [F,J,3,B]
-        drift = np.einsum("lj,fjxb->flxb", self.share, shift, optimize=True)
-        return outer @ drift
+        flat = shift.transpose(0, 3, 2, 1).reshape(len(outer), -1, self.joints)  # [F,B*3,J]
+        drift = (flat @ self.share).astype(np.float32)
+        drift = drift.reshape(len(outer), -1, 1, *outer.shape[2:])  # [F,B,1,3,L]
+        return (outer[:, None] * drift).sum(axis=3)
 
 
 @dataclass(eq=False)
-class _Jacobian:
+class Jacobian:
+    """shape [F,shapes,D,L], expression [F,E,D,L], pose [F,J,3,D,L] by axis-angle components,
+    translation [F,3,D,L]; float32."""
+
     shape: np.ndarray
     expression: np.ndarray
     pose: np.ndarray
