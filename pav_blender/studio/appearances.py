@@ -81,7 +81,7 @@ APPEARANCES = (
     Appearance(
         "grey",
         SkinLook(base=(0.55, 0.34, 0.255), lips=(0.43, 0.195, 0.165), redness=0.95, mottle=1.2,
-                 lines=1.0, under_hair=(0.17, 0.15, 0.14), under_beard=(0.36, 0.27, 0.235)),
+                 lines=0.6, under_hair=(0.17, 0.15, 0.14), under_beard=(0.36, 0.27, 0.235)),
         Lighting(
             (
                 AreaLight(-20, 50, 26, 1.2, colour=(0.93, 0.97, 1.0)),

@@ -54,7 +54,7 @@ def perform(head: HeadModel, frames: int, rng: np.random.Generator) -> Motion:
     """A performance of `frames` pictures; covers turns to both sides and a wide range of faces."""
     count = max(frames, 2)
     expression = np.zeros((count, len(head.expression_names)))
-    for recipes, beat, gain in ((MOODS, 1.6, 0.9), (VISEMES, 0.7, 1.0)):
+    for recipes, beat, gain in ((MOODS, 1.6, 1.0), (VISEMES, 0.7, 1.0)):
         for name, values in _speech(recipes, count, beat, rng).items():
             for channel in channels(head, name):
                 expression[:, channel] += gain * values
@@ -106,7 +106,7 @@ def _speech(recipes, count: int, beat: float, rng) -> dict[str, np.ndarray]:
     keys = int(np.ceil(count / step)) + 2
     order = np.concatenate([rng.permutation(len(recipes)) for _ in range(keys // len(recipes) + 1)])
     times = np.arange(keys) * step + rng.uniform(-0.25, 0.25, keys) * step - 0.5 * step
-    strength = rng.uniform(0.35, 1.0, keys)
+    strength = rng.uniform(0.5, 1.0, keys)
     names = {name for recipe in recipes for name in recipe}
     moments = np.arange(count)
     curves = {}

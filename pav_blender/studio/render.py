@@ -13,6 +13,7 @@ import numpy as np
 
 from ..core.collection import Clip, CollectionWriter
 from ..core.errors import InputError
+from ..core.files import write_text
 from ..core.head import builtin_head
 from .appearances import APPEARANCES, Appearance, build_scene
 from .camera import intrinsics_of, look_at
@@ -64,7 +65,10 @@ def render_collection(
     person = build_person(head, identity(head, seed))
     looks = APPEARANCES[:appearances]
     total, done = appearances * (frames + len(views)), 0
-    extra = {"made_by": "pav studio", "seed": seed, "frames": frames, "truth": truth}
+    extra = {
+        "made_by": "pav studio", "seed": seed, "frames": frames, "truth": truth,
+        "head_fingerprint": head.fingerprint,
+    }  # fmt: skip
     with CollectionWriter(out, "builtin", person.betas, extra=extra, overwrite=overwrite) as writer:
         for look in looks:
             shots = plan(person, look, frames, size, seed, views)
@@ -81,7 +85,28 @@ def render_collection(
                     if progress:
                         progress(done / total, f"{look.name} {shot.frame_id}")
             writer.clip(_clip(look, shots, size, vertices))
+        note = _note(appearances, frames, size, seed, truth, len(views))
+        write_text(writer.root / "README.md", note)
     return Path(out)
+
+
+def _note(appearances: int, frames: int, size: int, seed: int, truth: str, views: int) -> str:
+    """What the folder is, how it was made, and whose it is."""
+    return f"""# A synthetic person in {appearances} appearances
+
+Made by one command; nobody was filmed:
+
+    pav studio THIS_FOLDER --appearances {appearances} --frames {frames} --size {size} \\
+        --seed {seed} --truth {truth}
+
+One clip an appearance: {frames} frames of one performance (the last sixth is held out: split
+"test") and {views} pictures from cameras that no clip used (split "view"). Cycles renders the
+built-in head model, refined, with hair, clothes and light of its own. Beside the pictures
+(straight alpha: the alpha is the matte) lie labels, one number a pixel, and in `frames.npz` the
+exact camera and head parameters of every frame.
+
+Licence: CC0 1.0 (public domain), https://creativecommons.org/publicdomain/zero/1.0/
+"""
 
 
 def _check(appearances: int, frames: int, size: int, truth: str) -> None:

@@ -141,11 +141,11 @@ def tooth_shift(person: Person, name: str) -> tuple[int, tuple[float, float, flo
     front = points[points[:, 2] > points[:, 2].max() - 0.006]
     if name == "upper_teeth":
         rise = marks.mouth[1] + 0.0003 - front[:, 1].min()
-        return 1, (0.0, float(rise), float(marks.mouth[2] - 0.0105 - points[:, 2].max()))
+        return 1, (0.0, float(rise), float(marks.mouth[2] - 0.0118 - points[:, 2].max()))
     if name == "lower_teeth":
         rise = marks.mouth[1] - 0.0045 - front[:, 1].max()
         rise = min(max(rise, -0.004), 0.002)
-        return 2, (0.0, rise, float(marks.mouth[2] - 0.0140 - points[:, 2].max()))
+        return 2, (0.0, rise, float(marks.mouth[2] - 0.0150 - points[:, 2].max()))
     return 2, (0.0, 0.0, 0.0)
 
 

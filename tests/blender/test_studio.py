@@ -99,11 +99,14 @@ def test_performances_move_and_repeat(person):
     np.testing.assert_array_equal(first.expression, again.expression)
     np.testing.assert_array_equal(first.pose, again.pose)
     yaw = np.degrees(first.pose[:, 1, 1])
-    assert yaw.max() > 18 and yaw.min() < -18 and np.abs(yaw).max() <= 35.01
+    assert yaw.max() > 18
+    assert yaw.min() < -18
+    assert np.abs(yaw).max() <= 35.01
     names = list(person.head.expression_names)
     for name, least in (("jawOpen", 0.4), ("eyeBlinkLeft", 0.9), ("mouthSmileLeft", 0.3)):
         assert first.expression[:, names.index(name)].max() > least, name
-    assert first.expression.min() >= 0 and first.expression.max() <= 1
+    assert first.expression.min() >= 0
+    assert first.expression.max() <= 1
 
 
 def test_truth_lines_up_with_the_pictures(small):
