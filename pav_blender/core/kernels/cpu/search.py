@@ -1,10 +1,11 @@
-"""The search tree over a mesh's triangles, and its traversal by sixteen points at once.
+"""The search tree over a mesh's triangles, and its traversal by `LANES` points at once.
 
 The tree is complete, sixteen children a node: node i of a level holds nodes 16 i .. 16 i + 15 of
 the level below, and triangles are the lowest level, so there is nothing to chase. Its order comes
-from the rest mesh once; a pose only refits the boxes. A packet of sixteen points walks it as one:
-its box is tested against sixteen child boxes in a dozen instructions, and a triangle that survives
-is measured for all sixteen points without a branch.
+from the rest mesh once; a pose only refits the boxes. A packet of points walks it as one: the box
+around the packet is tested against sixteen child boxes in a dozen instructions; what survives is
+tested by every point against its own bound, and a triangle that survives that is measured for all
+points without a branch.
 """
 
 from __future__ import annotations
@@ -14,16 +15,34 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from . import simd
-from .simd import LANES
+from .lanes import (
+    LANES,
+    bits,
+    fma,
+    gather,
+    largest,
+    load,
+    lowest_bit,
+    maximum,
+    minimum,
+    select,
+    smallest,
+    splat,
+    splat_int,
+    store,
+)
+
+OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
+INLINE: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 
 # Floats of a triangle in `records`: corner a, axes X, Y, N of its plane, then in plane coordinates
-# (a at 0, b at (length, 0), c at (cx, cy)) length, cx, cy, 1/|ac|^2, 1/|bc|^2 and 1/length, 1/cy.
+# (a at 0, b at (length, 0), c at (cx, cy)) length, cx, cy, 1/|ac|^2, 1/|bc|^2, 1/length, 1/cy.
 RECORD = 20
 # A triangle lower than this fraction of its longest edge has no usable plane: never chosen.
 FLATNESS = 1e-5
-_OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
-_INLINE: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+_BOX = 6 * LANES  # floats of a node: the least x, y, z then the greatest of its children
+_LEVEL_BITS = 26
+STACK = 12 * LANES
 
 
 def build_order(centroids: np.ndarray) -> np.ndarray:
@@ -36,13 +55,11 @@ def build_order(centroids: np.ndarray) -> np.ndarray:
     while stack:
         start, stop = stack.pop()
         count = stop - start
-        if count <= 2:
+        if count <= LANES:
             continue
         whole = LANES
         while whole * LANES < count:
             whole *= LANES
-        if count <= LANES:
-            whole = 1
         cut = start + max(whole, round(count / 2 / whole) * whole)
         if cut >= stop:
             continue
@@ -54,15 +71,15 @@ def build_order(centroids: np.ndarray) -> np.ndarray:
     return order.astype(np.int32)
 
 
-def level_sizes(slots: int) -> list[int]:
-    """Nodes of each level from the triangles' parents up to the single root."""
+def level_starts(slots: int) -> np.ndarray:
+    """Where the boxes of each level begin, from the triangles' parents up to the single root."""
     sizes = [-(-max(slots, 1) // LANES)]
     while sizes[-1] > 1:
         sizes.append(-(-sizes[-1] // LANES))
-    return sizes
+    return np.concatenate([[0], np.cumsum(sizes) * _BOX]).astype(np.int64)
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def fit_triangles(start, stop, vertices, corners, order, records, boxes, usable):
     """Records and boxes of the triangles in slots start..stop, in float64 up to the rounding.
 
@@ -70,225 +87,245 @@ def fit_triangles(start, stop, vertices, corners, order, records, boxes, usable)
     """
     for slot in range(start, stop):
         triangle = order[slot]
-        ax, ay, az = np.float64(0), np.float64(0), np.float64(0)
-        usable_here = False
+        base = slot * RECORD
+        box = (slot // LANES) * _BOX + slot % LANES
+        good = False
         if triangle >= 0:
             a, b, c = corners[triangle, 0], corners[triangle, 1], corners[triangle, 2]
-            ax, ay, az = vertices[a, 0], vertices[a, 1], vertices[a, 2]
+            ax, ay, az = (
+                np.float64(vertices[a, 0]),
+                np.float64(vertices[a, 1]),
+                np.float64(vertices[a, 2]),
+            )
             bx, by, bz = vertices[b, 0] - ax, vertices[b, 1] - ay, vertices[b, 2] - az
             dx, dy, dz = vertices[c, 0] - ax, vertices[c, 1] - ay, vertices[c, 2] - az
             nx, ny, nz = by * dz - bz * dy, bz * dx - bx * dz, bx * dy - by * dx
             area = np.sqrt(nx * nx + ny * ny + nz * nz)
             bb, cc = bx * bx + by * by + bz * bz, dx * dx + dy * dy + dz * dz
-            ex, ey, ez = dx - bx, dy - by, dz - bz
-            ee = ex * ex + ey * ey + ez * ez
-            usable_here = area > FLATNESS * max(bb, cc, ee)
-            usable[triangle] = usable_here
-        node, lane = slot // LANES, slot % LANES
-        box = node * 6 * LANES + lane
-        if not usable_here:
+            ee = (dx - bx) ** 2 + (dy - by) ** 2 + (dz - bz) ** 2
+            good = area > FLATNESS * max(bb, cc, ee) and area < np.inf
+            usable[triangle] = good
+            if good:
+                length = np.sqrt(bb)
+                xx, xy, xz = bx / length, by / length, bz / length
+                nx, ny, nz = nx / area, ny / area, nz / area
+                records[base], records[base + 1], records[base + 2] = ax, ay, az
+                records[base + 3], records[base + 4], records[base + 5] = xx, xy, xz
+                records[base + 6] = ny * xz - nz * xy
+                records[base + 7] = nz * xx - nx * xz
+                records[base + 8] = nx * xy - ny * xx
+                records[base + 9], records[base + 10], records[base + 11] = nx, ny, nz
+                records[base + 12] = length
+                records[base + 13] = dx * xx + dy * xy + dz * xz
+                records[base + 14] = area / length
+                records[base + 15], records[base + 16] = 1.0 / cc, 1.0 / ee
+                records[base + 17], records[base + 18] = 1.0 / length, length / area
+                records[base + 19] = 0.0
+                for axis in range(3):
+                    p, q, r = vertices[a, axis], vertices[b, axis], vertices[c, axis]
+                    low, high = min(p, q, r), max(p, q, r)
+                    # Wider than any rounding of the distance to what is inside.
+                    pad = np.float32(4e-7) * (abs(low) + abs(high))
+                    boxes[box + axis * LANES] = low - pad
+                    boxes[box + (axis + 3) * LANES] = high + pad
+        if not good:
+            for i in range(RECORD):
+                records[base + i] = 0.0
+            records[base] = np.inf
             for axis in range(3):
                 boxes[box + axis * LANES] = np.inf
                 boxes[box + (axis + 3) * LANES] = -np.inf
-            for i in range(RECORD):
-                records[slot * RECORD + i] = 0.0
-            records[slot * RECORD] = np.inf
-            continue
-        length = np.sqrt(bb)
-        xx, xy, xz = bx / length, by / length, bz / length
-        nx, ny, nz = nx / area, ny / area, nz / area
-        yx, yy, yz = ny * xz - nz * xy, nz * xx - nx * xz, nx * xy - ny * xx
-        cx, cy = dx * xx + dy * xy + dz * xz, area / length
-        record = records[slot * RECORD : slot * RECORD + RECORD]
-        record[0], record[1], record[2] = ax, ay, az
-        record[3], record[4], record[5] = xx, xy, xz
-        record[6], record[7], record[8] = yx, yy, yz
-        record[9], record[10], record[11] = nx, ny, nz
-        record[12], record[13], record[14] = length, cx, cy
-        record[15], record[16] = 1.0 / cc, 1.0 / ee
-        record[17], record[18], record[19] = 1.0 / length, 1.0 / cy, 0.0
-        for axis in range(3):
-            p, q, r = vertices[a, axis], vertices[b, axis], vertices[c, axis]
-            low, high = min(p, q, r), max(p, q, r)
-            # Wider than any rounding of the distance to what is inside.
-            pad = np.float32(4e-7) * (abs(low) + abs(high))
-            boxes[box + axis * LANES] = low - pad
-            boxes[box + (axis + 3) * LANES] = high + pad
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def fit_levels(boxes, starts):
     """Boxes of the nodes from those of their children, level by level."""
     for level in range(1, len(starts) - 1):
-        below = (starts[level] - starts[level - 1]) // (6 * LANES)
-        nodes = (starts[level + 1] - starts[level]) // (6 * LANES)
+        below = (starts[level] - starts[level - 1]) // _BOX
+        nodes = (starts[level + 1] - starts[level]) // _BOX
         for child in range(nodes * LANES):
-            target = starts[level] + (child // LANES) * 6 * LANES + child % LANES
-            source = starts[level - 1] + child * 6 * LANES
+            target = starts[level] + (child // LANES) * _BOX + child % LANES
+            source = starts[level - 1] + child * _BOX
             for axis in range(3):
                 low, high = np.float32(np.inf), np.float32(-np.inf)
                 if child < below:
-                    for lane in range(LANES):
-                        low = min(low, boxes[source + axis * LANES + lane])
-                        high = max(high, boxes[source + (axis + 3) * LANES + lane])
+                    for i in range(LANES):
+                        low = min(low, boxes[source + axis * LANES + i])
+                        high = max(high, boxes[source + (axis + 3) * LANES + i])
                 boxes[target + axis * LANES] = low
                 boxes[target + (axis + 3) * LANES] = high
 
 
-@njit(**_INLINE)
+@njit(**INLINE)
 def _clamp(x):
-    return simd.minimum(simd.maximum(x, simd.splat(0.0)), simd.splat(1.0))
+    return minimum(maximum(x, splat(0.0)), splat(1.0))
 
 
-@njit(**_INLINE)
-def measure(records, slot, px, py, pz):
-    """Squared distance of sixteen points to the triangle in a slot."""
-    r = slot * RECORD
-    dx = px - simd.splat(records[r])
-    dy = py - simd.splat(records[r + 1])
-    dz = pz - simd.splat(records[r + 2])
-    x = simd.splat(records[r + 3]) * dx
-    x = simd.fma(simd.splat(records[r + 4]), dy, x)
-    x = simd.fma(simd.splat(records[r + 5]), dz, x)
-    y = simd.splat(records[r + 6]) * dx
-    y = simd.fma(simd.splat(records[r + 7]), dy, y)
-    y = simd.fma(simd.splat(records[r + 8]), dz, y)
-    z = simd.splat(records[r + 9]) * dx
-    z = simd.fma(simd.splat(records[r + 10]), dy, z)
-    z = simd.fma(simd.splat(records[r + 11]), dz, z)
-    zero = simd.splat(0.0)
-    length, cx, cy = records[r + 12], simd.splat(records[r + 13]), simd.splat(records[r + 14])
-    ex = simd.splat(records[r + 13] - length)
-    beyond = x - simd.splat(length)
-    # Edges ab, ac, bc in the plane.
-    gap = simd.maximum(simd.maximum(beyond, zero - x), zero)
-    yy = y * y
-    best = simd.fma(gap, gap, yy)
-    t = _clamp(simd.fma(x, cx, y * cy) * simd.splat(records[r + 15]))
-    gx, gy = x - t * cx, y - t * cy
-    best = simd.minimum(best, simd.fma(gx, gx, gy * gy))
-    t = _clamp(simd.fma(beyond, ex, y * cy) * simd.splat(records[r + 16]))
-    gx, gy = beyond - t * ex, y - t * cy
-    best = simd.minimum(best, simd.fma(gx, gx, gy * gy))
-    inside = simd.minimum(y, simd.minimum(cy * x - cx * y, ex * y - cy * beyond))
-    best = simd.select(zero <= inside, zero, best)
-    return simd.fma(z, z, best)
+@njit(**INLINE)
+def _to_plane(x, y, z, dx, dy, dz):
+    return fma(z, dz, fma(y, dy, x * dx))
 
 
-@njit(**_INLINE)
-def _box_distance(boxes, start, lx, ly, lz, hx, hy, hz):
-    """Squared distance of one box to sixteen child boxes."""
-    zero = simd.splat(0.0)
-    dx = simd.maximum(
-        simd.maximum(simd.load(boxes, start) - hx, lx - simd.load(boxes, start + 3 * LANES)), zero
-    )
-    dy = simd.maximum(
-        simd.maximum(
-            simd.load(boxes, start + LANES) - hy, ly - simd.load(boxes, start + 4 * LANES)
-        ),
-        zero,
-    )
-    dz = simd.maximum(
-        simd.maximum(
-            simd.load(boxes, start + 2 * LANES) - hz, lz - simd.load(boxes, start + 5 * LANES)
-        ),
-        zero,
-    )
-    return simd.fma(dx, dx, simd.fma(dy, dy, dz * dz))
+@njit(**INLINE)
+def _in_plane(x, y, z, length, cx, cy, inverse_ac, inverse_bc, inverse_length, inverse_cy):
+    """Squared distance of plane coordinates (x, y, height z), barycentrics of the nearest point.
 
-
-@njit(**_INLINE)
-def search(tree, px, py, pz, seed, stack_node, stack_distance, scratch, counters):
-    """Nearest slot of sixteen points (all finite) and its squared distance; -1, inf for none.
-
-    `seed` is a slot likely to be near, or -1. Ties go to the lowest triangle index.
+    Weights that vanish on an edge or at a corner are 0 exactly.
     """
-    boxes, starts, records, order = tree
-    lx, hx = simd.splat(simd.smallest(px)), simd.splat(simd.largest(px))
-    ly, hy = simd.splat(simd.smallest(py)), simd.splat(simd.largest(py))
-    lz, hz = simd.splat(simd.smallest(pz)), simd.splat(simd.largest(pz))
-    best = simd.splat(np.inf)
-    found = simd.splat_int(-1)
-    if seed >= 0:
-        distance = measure(records, seed, px, py, pz)
-        closer = distance < best  # not where the seed is degenerate in this pose
-        best = simd.select(closer, distance, best)
-        found = simd.select(closer, simd.splat_int(seed), found)
-    # Rounding must not hide a tie: boxes are padded, the bound is a little generous.
-    bound = simd.largest(best) * np.float32(1.000001)
+    zero, one = splat(0.0), splat(1.0)
+    beyond, ex = x - length, cx - length
+    wb = _clamp(x * inverse_length)
+    wa, wc = one - wb, zero
+    gap = maximum(maximum(beyond, zero - x), zero)
+    best = fma(gap, gap, y * y)
+    t = _clamp(fma(x, cx, y * cy) * inverse_ac)
+    gx, gy = x - t * cx, y - t * cy
+    distance = fma(gx, gx, gy * gy)
+    closer = distance < best
+    best = select(closer, distance, best)
+    wa, wb, wc = select(closer, one - t, wa), select(closer, zero, wb), select(closer, t, wc)
+    t = _clamp(fma(beyond, ex, y * cy) * inverse_bc)
+    gx, gy = beyond - t * ex, y - t * cy
+    distance = fma(gx, gx, gy * gy)
+    closer = distance < best
+    best = select(closer, distance, best)
+    wa, wb, wc = select(closer, zero, wa), select(closer, one - t, wb), select(closer, t, wc)
+    inside = zero <= minimum(y, minimum(cy * x - cx * y, ex * y - cy * beyond))
+    best = select(inside, zero, best)
+    inner_c = _clamp(y * inverse_cy)
+    inner_b = _clamp((x - inner_c * cx) * inverse_length)
+    wa = select(inside, _clamp(one - inner_b - inner_c), wa)
+    wb, wc = select(inside, inner_b, wb), select(inside, inner_c, wc)
+    return fma(z, z, best), wa, wb, wc
+
+
+@njit(**INLINE)
+def measure(records, slot, px, py, pz):
+    """Squared distance of the packet's points to the triangle in one slot."""
+    r = slot * RECORD
+    dx, dy, dz = px - splat(records[r]), py - splat(records[r + 1]), pz - splat(records[r + 2])
+    x = _to_plane(splat(records[r + 3]), splat(records[r + 4]), splat(records[r + 5]), dx, dy, dz)
+    y = _to_plane(splat(records[r + 6]), splat(records[r + 7]), splat(records[r + 8]), dx, dy, dz)
+    z = _to_plane(splat(records[r + 9]), splat(records[r + 10]), splat(records[r + 11]), dx, dy, dz)
+    squared, _, _, _ = _in_plane(
+        x,
+        y,
+        z,
+        splat(records[r + 12]),
+        splat(records[r + 13]),
+        splat(records[r + 14]),
+        splat(records[r + 15]),
+        splat(records[r + 16]),
+        splat(records[r + 17]),
+        splat(records[r + 18]),
+    )
+    return squared
+
+
+@njit(**INLINE)
+def foot(records, slots, px, py, pz):
+    """Each point's nearest point on the triangle in its own slot: barycentrics, then the place."""
+    r = slots * splat_int(RECORD)
+    ax, ay, az = gather(records, r, 0), gather(records, r, 1), gather(records, r, 2)
+    xx, xy, xz = gather(records, r, 3), gather(records, r, 4), gather(records, r, 5)
+    yx, yy, yz = gather(records, r, 6), gather(records, r, 7), gather(records, r, 8)
+    length, cx, cy = gather(records, r, 12), gather(records, r, 13), gather(records, r, 14)
+    dx, dy, dz = px - ax, py - ay, pz - az
+    _, wa, wb, wc = _in_plane(
+        _to_plane(xx, xy, xz, dx, dy, dz),
+        _to_plane(yx, yy, yz, dx, dy, dz),
+        splat(0.0),
+        length,
+        cx,
+        cy,
+        gather(records, r, 15),
+        gather(records, r, 16),
+        gather(records, r, 17),
+        gather(records, r, 18),
+    )
+    u, v = fma(wb, length, wc * cx), wc * cy
+    qx = fma(xx, u, fma(yx, v, ax))
+    qy = fma(xy, u, fma(yy, v, ay))
+    qz = fma(xz, u, fma(yz, v, az))
+    return wa, wb, wc, qx, qy, qz
+
+
+@njit(**INLINE)
+def _gap(low, high, least, greatest):
+    """How far apart two intervals are, 0 where they meet."""
+    return maximum(maximum(low - greatest, least - high), splat(0.0))
+
+
+@njit(**INLINE)
+def _packet_distances(boxes, start, lx, ly, lz, hx, hy, hz):
+    """Squared distance of the packet's box to the children of the node at `start`."""
+    dx = _gap(load(boxes, start), load(boxes, start + 3 * LANES), lx, hx)
+    dy = _gap(load(boxes, start + LANES), load(boxes, start + 4 * LANES), ly, hy)
+    dz = _gap(load(boxes, start + 2 * LANES), load(boxes, start + 5 * LANES), lz, hz)
+    return fma(dx, dx, fma(dy, dy, dz * dz))
+
+
+@njit(**INLINE)
+def _may_hold(boxes, at, px, py, pz, bound):
+    """Whether any point is nearer than its bound to the box whose numbers begin at `at`."""
+    dx = _gap(splat(boxes[at]), splat(boxes[at + 3 * LANES]), px, px)
+    dy = _gap(splat(boxes[at + LANES]), splat(boxes[at + 4 * LANES]), py, py)
+    dz = _gap(splat(boxes[at + 2 * LANES]), splat(boxes[at + 5 * LANES]), pz, pz)
+    return bits(fma(dx, dx, fma(dy, dy, dz * dz)) <= bound) != 0
+
+
+@njit(**INLINE)
+def search(boxes, starts, records, px, py, pz, best, found, stack, scratch):
+    """Squared distance and slot of the triangle nearest to each point (all must be finite).
+
+    `best`, `found` hold what is known: a bound that is certain to be reached (or infinity), and the
+    slot it came from or -1. Only what is closer than `best` replaces it.
+    """
+    lx, hx = splat(smallest(px)), splat(largest(px))
+    ly, hy = splat(smallest(py)), splat(largest(py))
+    lz, hz = splat(smallest(pz)), splat(largest(pz))
+    # Boxes are padded and bounds generous, so that rounding hides no triangle.
+    slack = np.float32(1.000001)
+    bound = largest(best) * slack
     top = len(starts) - 2
-    stack_node[0] = 0
-    stack_distance[0] = 0.0
-    level_bits = 26
-    stack_node[0] = top << level_bits
+    stack[0] = top << _LEVEL_BITS
     size = 1
     while size > 0:
         size -= 1
-        if stack_distance[size] > bound:
-            continue
-        entry = stack_node[size]
-        level, node = entry >> level_bits, entry & ((1 << level_bits) - 1)
-        start = starts[level] + node * 6 * LANES
-        near = _box_distance(boxes, start, lx, ly, lz, hx, hy, hz)
-        counters[0] += 1
-        word = simd.bits(near <= simd.splat(bound))
+        entry = stack[size]
+        level, node = entry >> _LEVEL_BITS, entry & ((1 << _LEVEL_BITS) - 1)
+        if level < top:
+            at = starts[level + 1] + (node // LANES) * _BOX + node % LANES
+            if not _may_hold(boxes, at, px, py, pz, best * splat(slack)):
+                continue
+        start = starts[level] + node * _BOX
+        near = _packet_distances(boxes, start, lx, ly, lz, hx, hy, hz)
+        word = bits(near <= splat(bound))
         if level > 0:
-            simd.store(scratch, 0, near)
-            least = np.float32(np.inf)
-            least_at = size
+            store(scratch, 0, near)
+            least, least_at = np.float32(np.inf), size
             while word != 0:
-                child = simd.lowest_bit(word)
+                child = lowest_bit(word)
                 word &= word - 1
-                distance_child = scratch[child]
-                if distance_child < np.inf:
-                    if distance_child < least:
-                        least = distance_child
-                        least_at = size
-                    stack_node[size] = ((level - 1) << level_bits) + node * LANES + child
-                    stack_distance[size] = distance_child
+                if scratch[child] < np.inf:  # an empty box passes where nothing is known yet
+                    if scratch[child] < least:
+                        least, least_at = scratch[child], size
+                    stack[size] = ((level - 1) << _LEVEL_BITS) + node * LANES + child
                     size += 1
             if least < np.inf:  # the nearest child is next
-                last = size - 1
-                stack_node[least_at], stack_node[last] = stack_node[last], stack_node[least_at]
-                stack_distance[least_at], stack_distance[last] = (
-                    stack_distance[last],
-                    stack_distance[least_at],
-                )
+                stack[least_at], stack[size - 1] = stack[size - 1], stack[least_at]
             continue
         while word != 0:
-            child = simd.lowest_bit(word)
+            child = lowest_bit(word)
             word &= word - 1
+            if not _may_hold(boxes, start + child, px, py, pz, best * splat(slack)):
+                continue
             slot = node * LANES + child
-            distance = measure(records, slot, px, py, pz)
-            counters[1] += 1
-            closer = distance < best
-            if simd.bits(closer) != 0:
-                best = simd.select(closer, distance, best)
-                found = simd.select(closer, simd.splat_int(slot), found)
-                bound = simd.largest(best) * np.float32(1.000001)
-                word &= simd.bits(near <= simd.splat(bound))
+            squared = measure(records, slot, px, py, pz)
+            closer = squared < best
+            if bits(closer) != 0:
+                best = select(closer, squared, best)
+                found = select(closer, splat_int(slot), found)
+                bound = largest(best) * slack
+                word &= bits(near <= splat(bound))
     return best, found
-
-
-@njit(**_OPTIONS)
-def raw(start, stop, points, tree, out_slot, out_d, counters):
-    stack_node = np.empty(16 * 8, np.int32)
-    stack_distance = np.empty(16 * 8, np.float32)
-    scratch = np.empty(16, np.float32)
-    x = np.empty(16, np.float32)
-    y = np.empty(16, np.float32)
-    z = np.empty(16, np.float32)
-    seed = np.int32(-1)
-    for p in range(start, stop, 16):
-        for i in range(16):
-            q = min(p + i, stop - 1)
-            x[i] = points[q, 0]
-            y[i] = points[q, 1]
-            z[i] = points[q, 2]
-        best, found = search(
-            tree, simd.load(x, 0), simd.load(y, 0), simd.load(z, 0), seed,
-            stack_node, stack_distance, scratch, counters,
-        )
-        seed = simd.lane(found, 15)
-        simd.store(out_slot, p, found)
-        simd.store(out_d, p, best)

@@ -1,0 +1,389 @@
+"""Sampling rays against a posed mesh sixteen at a time, leaping over what is empty.
+
+Samples of ray r lie at `t_k = (k + jitter[r]) * step`, k an integer; directions are unit vectors.
+Sixteen consecutive rays walk side by side, each at its own k, so rays should come in an order in
+which neighbours are neighbours in the picture (tiles of 4x4 pixels).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numba import njit
+
+from ..reference.marching import bounds, lattice
+from ..structures import Clearance, PosedMesh, Wave
+from .compositing import composite, composite_step
+from .lanes import (
+    LANES,
+    bits,
+    fma,
+    gather,
+    lane,
+    load,
+    lowest_bit,
+    select,
+    splat,
+    splat_int,
+    square_root,
+    store,
+    to_float,
+)
+from .nearest import settle
+from .search import INLINE, OPTIONS, STACK, foot, search
+from .threads import run_chunks
+
+__all__ = ["bounds", "canonicalise", "composite", "composite_step", "lattice", "march"]
+
+_CHUNK = 256  # rays a thread takes at a time: a multiple of LANES
+# Of a clear distance in canonical space, what a step in posed space may use: the maps stretch.
+_TRUST = 0.7
+
+
+@njit(**INLINE)
+def _row(maps, r, row, x, y, z, w):
+    """One row of the maps at offsets r: applied to (x, y, z), plus w times its last column."""
+    last = gather(maps, r, row + 3) * w
+    last = fma(gather(maps, r, row + 2), z, last)
+    return fma(gather(maps, r, row), x, fma(gather(maps, r, row + 1), y, last))
+
+
+@njit(**INLINE)
+def _apply(maps, r, x, y, z, w):
+    """The maps at offsets r applied to (x, y, z), plus w times their last columns."""
+    return (
+        _row(maps, r, 0, x, y, z, w),
+        _row(maps, r, 4, x, y, z, w),
+        _row(maps, r, 8, x, y, z, w),
+    )
+
+
+@njit(**INLINE)
+def _canonical(triangle_maps, vertex_maps, vertices, corners, triangle, wa, wb, wc, px, py, pz):
+    """Canonical places of a packet; triangles must not be negative. `kernels/structures.py`."""
+    if len(vertex_maps) == 0:
+        return _apply(triangle_maps, triangle * splat_int(12), px, py, pz, splat(1.0))
+    three, twelve = splat_int(3), splat_int(12)
+    a = gather(corners, triangle * three, 0)
+    b = gather(corners, triangle * three, 1)
+    c = gather(corners, triangle * three, 2)
+    i, j, k = a * three, b * three, c * three
+    dx = px - wa * gather(vertices, i, 0) - wb * gather(vertices, j, 0)
+    dy = py - wa * gather(vertices, i, 1) - wb * gather(vertices, j, 1)
+    dz = pz - wa * gather(vertices, i, 2) - wb * gather(vertices, j, 2)
+    dx = dx - wc * gather(vertices, k, 0)
+    dy = dy - wc * gather(vertices, k, 1)
+    dz = dz - wc * gather(vertices, k, 2)
+    x, y, z = _apply(vertex_maps, a * twelve, wa * dx, wa * dy, wa * dz, wa)
+    u, v, w = _apply(vertex_maps, b * twelve, wb * dx, wb * dy, wb * dz, wb)
+    x, y, z = x + u, y + v, z + w
+    u, v, w = _apply(vertex_maps, c * twelve, wc * dx, wc * dy, wc * dz, wc)
+    return x + u, y + v, z + w
+
+
+@njit(**INLINE)
+def _clear_cells(grid, size, corner, scale, x, y, z):
+    """Cells to the nearest occupied one from canonical (x, y, z): 0 inside an occupied cell."""
+    fx, fy, fz = (x - corner[0]) * scale, (y - corner[1]) * scale, (z - corner[2]) * scale
+    outside = max(max(-fx, -fy, -fz), max(fx, fy, fz) - np.float32(size))
+    within = min(fx, fy, fz) >= 0 and max(fx, fy, fz) < size
+    if within:
+        return int(grid[(int(fx) * size + int(fy)) * size + int(fz)])
+    if outside > 0:
+        return 1 + int(min(outside, np.float32(254.0)))
+    return 1  # on the far face, or not a number
+
+
+@njit(**OPTIONS)
+def _march(
+    start,
+    stop,
+    arrays,
+    triangle_maps,
+    vertex_maps,
+    vertices,
+    flat_corners,
+    origins,
+    directions,
+    first,
+    last,
+    jitter,
+    step,
+    grid,
+    size,
+    corner,
+    scale,
+    band,
+    leap_limit,
+    wave,
+    out_count,
+    out_next,
+    out_k,
+    out_triangle,
+    out_barycentric,
+    out_canonical,
+    out_distance,
+):
+    boxes, starts, records = arrays[0], arrays[1], arrays[2]
+    stack = np.empty(STACK, np.int32)
+    scratch = np.empty(LANES, np.float32)
+    rays = np.empty(7 * LANES, np.float32)  # origin, direction, jitter
+    feet = np.empty(3 * LANES, np.float32)
+    canonical = np.empty(3 * LANES, np.float32)
+    distances = np.empty(LANES, np.float32)
+    barycentric = np.empty(3 * LANES, np.float32)
+    triangle = np.empty(LANES, np.int32)
+    ks = np.empty(LANES, np.int32)
+    active = np.empty(LANES, np.int32)
+    steps = splat(step)
+    cell = np.float32(1.0) / scale
+    for base in range(start, stop, LANES):
+        alive = 0
+        for i in range(LANES):
+            ray = min(base + i, stop - 1)
+            for axis in range(3):
+                rays[axis * LANES + i] = origins[ray, axis]
+                rays[(axis + 3) * LANES + i] = directions[ray, axis]
+                feet[axis * LANES + i] = np.inf
+            rays[6 * LANES + i] = jitter[ray]
+            ks[i] = first[ray]
+            active[i] = 1 if base + i < stop and first[ray] <= last[ray] else 0
+            alive += active[i]
+            if base + i < stop:
+                out_count[ray] = 0
+                out_next[ray] = max(first[ray], last[ray] + 1)
+        while alive > 0:
+            going = splat_int(0) < load(active, 0)
+            t = (to_float(load(ks, 0)) + load(rays, 6 * LANES)) * steps
+            px = fma(t, load(rays, 3 * LANES), load(rays, 0))
+            py = fma(t, load(rays, 4 * LANES), load(rays, LANES))
+            pz = fma(t, load(rays, 5 * LANES), load(rays, 2 * LANES))
+            some = lowest_bit(bits(going))
+            px = select(going, px, splat(lane(px, some)))
+            py = select(going, py, splat(lane(py, some)))
+            pz = select(going, pz, splat(lane(pz, some)))
+            # The last nearest point is a bound; rounding must leave it above the answer.
+            gx, gy, gz = px - load(feet, 0), py - load(feet, LANES), pz - load(feet, 2 * LANES)
+            best = fma(gx, gx, fma(gy, gy, fma(gz, gz, splat(1e-12)))) * splat(1.00001)
+            best = select(going, best, splat(-1.0))
+            best, found = search(
+                boxes, starts, records, px, py, pz, best, splat_int(-1), stack, scratch
+            )
+            slots = select(found < splat_int(0), splat_int(0), found)
+            wa, wb, wc, qx, qy, qz = foot(records, slots, px, py, pz)
+            store(feet, 0, qx)
+            store(feet, LANES, qy)
+            store(feet, 2 * LANES, qz)
+            distance_here = square_root(select(going, best, splat(0.0)))
+            store(distances, 0, distance_here)
+            settle(arrays, found, wa, wb, wc, triangle, barycentric)
+            if bits(going & (distance_here <= splat(band))) != 0:
+                index = load(triangle, 0)
+                x, y, z = _canonical(
+                    triangle_maps,
+                    vertex_maps,
+                    vertices,
+                    flat_corners,
+                    select(index < splat_int(0), splat_int(0), index),
+                    load(barycentric, 0),
+                    load(barycentric, LANES),
+                    load(barycentric, 2 * LANES),
+                    px,
+                    py,
+                    pz,
+                )
+                store(canonical, 0, x)
+                store(canonical, LANES, y)
+                store(canonical, 2 * LANES, z)
+            for i in range(LANES):
+                if active[i] == 0:
+                    continue
+                ray = base + i
+                k = ks[i]
+                distance = distances[i]
+                clear = np.float32(0.0)
+                if triangle[i] < 0:
+                    clear = np.float32(np.inf)
+                elif distance > band:
+                    clear = (distance - band) * np.float32(0.99999)
+                else:
+                    cells = 0
+                    if size > 0:
+                        cells = _clear_cells(
+                            grid,
+                            size,
+                            corner,
+                            scale,
+                            canonical[i],
+                            canonical[LANES + i],
+                            canonical[2 * LANES + i],
+                        )
+                    if cells == 0:
+                        slot = out_count[ray]
+                        out_k[ray, slot] = k
+                        out_triangle[ray, slot] = triangle[i]
+                        out_distance[ray, slot] = distance
+                        for axis in range(3):
+                            out_barycentric[ray, slot, axis] = barycentric[axis * LANES + i]
+                            out_canonical[ray, slot, axis] = canonical[axis * LANES + i]
+                        out_count[ray] = slot + 1
+                        if slot + 1 == wave:
+                            out_next[ray] = k + 1
+                            active[i] = 0
+                            alive -= 1
+                            continue
+                    else:
+                        clear = min(np.float32(cells - 1) * cell * np.float32(_TRUST), leap_limit)
+                leap = np.int32(min(clear / step, np.float32(last[ray] - k))) + 1
+                ks[i] = k + leap
+                if k + leap > last[ray]:
+                    active[i] = 0
+                    alive -= 1
+    for ray in range(start, stop):
+        for slot in range(out_count[ray], wave):
+            out_k[ray, slot] = -1
+            out_triangle[ray, slot] = -1
+            out_distance[ray, slot] = 0.0
+            for axis in range(3):
+                out_barycentric[ray, slot, axis] = 0.0
+                out_canonical[ray, slot, axis] = 0.0
+
+
+_NOTHING = np.empty(0, np.float32)
+
+
+def _flat(values: torch.Tensor | None) -> np.ndarray:
+    if values is None:
+        return _NOTHING
+    return np.ascontiguousarray(values.detach().numpy(), np.float32).reshape(-1)
+
+
+def _rows(values: torch.Tensor, kind: type) -> np.ndarray:
+    return np.ascontiguousarray(values.detach().numpy(), kind)
+
+
+def march(
+    mesh: PosedMesh,
+    origins: torch.Tensor,
+    directions: torch.Tensor,
+    first: torch.Tensor,
+    last: torch.Tensor,
+    jitter: torch.Tensor,
+    step: float,
+    *,
+    wave: int,
+    clearance: Clearance | None = None,
+    band: float = np.inf,
+    leap_limit: float = 0.004,
+) -> Wave:
+    """Up to `wave` samples a ray among lattice indices first..last [R] int32, in order.
+
+    A sample counts when it is within `band` metres of the posed mesh and, with a clearance, when
+    its canonical cell is occupied. Outside the band a ray leaps by what certainly stays outside; in
+    empty cells by 0.7 of the clear distance, at most `leap_limit` metres, which can pass over an
+    occupied cell only where the map to canonical space stretches more or jumps (between lips).
+    """
+    count = len(origins)
+    grid, size, corner, scale = np.empty(0, np.uint8), 0, np.zeros(3, np.float32), 1.0
+    if clearance is not None:
+        size = clearance.grid.shape[0]
+        grid = np.ascontiguousarray(clearance.grid.numpy(), np.uint8).reshape(-1)
+        corner = _flat(clearance.box_min)
+        scale = clearance.box_scale * size
+    result = Wave(
+        torch.empty(count, dtype=torch.int32),
+        torch.empty(count, dtype=torch.int32),
+        torch.empty((count, wave), dtype=torch.int32),
+        torch.empty((count, wave), dtype=torch.int32),
+        torch.empty((count, wave, 3)),
+        torch.empty((count, wave, 3)),
+        torch.empty((count, wave)),
+    )
+    run_chunks(
+        _march,
+        count,
+        _CHUNK,
+        mesh.search.arrays,
+        _flat(mesh.triangle_maps),
+        _flat(mesh.vertex_maps),
+        _flat(mesh.vertices),
+        mesh.search.topology.corners.reshape(-1),
+        _rows(origins, np.float32),
+        _rows(directions, np.float32),
+        _rows(first, np.int32),
+        _rows(last, np.int32),
+        _rows(jitter, np.float32),
+        np.float32(step),
+        grid,
+        size,
+        corner,
+        np.float32(scale),
+        np.float32(band),
+        np.float32(leap_limit),
+        wave,
+        *(values.numpy() for values in result),
+    )
+    return result
+
+
+@njit(**OPTIONS)
+def _canonicalise(
+    start, stop, points, triangles, barycentric, triangle_maps, vertex_maps, vertices, corners, out
+):
+    place = np.empty(6 * LANES, np.float32)
+    index = np.empty(LANES, np.int32)
+    for base in range(start, stop, LANES):
+        count = min(LANES, stop - base)
+        for i in range(LANES):
+            row = base + min(i, count - 1)
+            index[i] = max(triangles[row], 0)
+            for axis in range(3):
+                place[axis * LANES + i] = points[row, axis]
+                place[(axis + 3) * LANES + i] = barycentric[row, axis]
+        x, y, z = _canonical(
+            triangle_maps,
+            vertex_maps,
+            vertices,
+            corners,
+            load(index, 0),
+            load(place, 3 * LANES),
+            load(place, 4 * LANES),
+            load(place, 5 * LANES),
+            load(place, 0),
+            load(place, LANES),
+            load(place, 2 * LANES),
+        )
+        store(place, 0, x)
+        store(place, LANES, y)
+        store(place, 2 * LANES, z)
+        for i in range(count):
+            for axis in range(3):
+                lost = triangles[base + i] < 0
+                out[base + i, axis] = points[base + i, axis] if lost else place[axis * LANES + i]
+
+
+def canonicalise(
+    points: torch.Tensor,
+    triangle: torch.Tensor,
+    barycentric: torch.Tensor,
+    mesh: PosedMesh,
+) -> torch.Tensor:
+    """Posed points [N,3] with nearest triangle [N] and barycentrics [N,3] -> canonical [N,3].
+
+    Points without a triangle (-1) keep their place. Not differentiable.
+    """
+    out = torch.empty((len(points), 3))
+    run_chunks(
+        _canonicalise,
+        len(points),
+        8192,
+        _rows(points, np.float32),
+        _rows(triangle, np.int32),
+        _rows(barycentric, np.float32),
+        _flat(mesh.triangle_maps),
+        _flat(mesh.vertex_maps),
+        _flat(mesh.vertices),
+        mesh.search.topology.corners.reshape(-1),
+        out.numpy(),
+    )
+    return out
