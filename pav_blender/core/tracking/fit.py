@@ -265,7 +265,9 @@ def _weights(model: LandmarkModel, betas: np.ndarray, clip: _Clip, fit: ClipFit)
     view = -posed.points / np.linalg.norm(posed.points, axis=2, keepdims=True)
     facing = (((normals * view).sum(axis=2) - 0.05) / 0.4).clip(0.03, 1)
     distance = np.linalg.norm(_project(posed.points, fit.focal) - clip.target, axis=2)
-    robust = 1 / (1 + (distance / (4 * clip.scatter)) ** 2)
+    # while everything is still far off, nothing is an outlier yet
+    usual = max(clip.scatter, float(np.median(distance)))
+    robust = 1 / (1 + (distance / (4 * usual)) ** 2)
     return clip.trust * facing * robust / clip.scatter**2
 
 

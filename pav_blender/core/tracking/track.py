@@ -13,6 +13,8 @@ from ..collection import Clip, CollectionWriter
 from ..errors import Cancelled, InputError
 from ..head import HeadModel, load_head
 from ..progress import Report
+from ..rendering.cameras import Camera
+from ..rendering.rasterise import rasterise
 from . import matte
 from .crop import Crop, content_box, cut, plan_crop
 from .decode import Frame, Video, open_video
@@ -116,7 +118,9 @@ def track(
             clip = _clip(head_model, fit.betas, done, size)
             writer.clip(clip)
             tell_clip = _part(tell, start + share * index, share)
-            _write_pictures(writer, clip, done, cut_background, tell_clip, should_stop)
+            _write_pictures(
+                writer, head_model, fit.betas, clip, done, cut_background, tell_clip, should_stop
+            )
     tell(1.0, step="done")
     return TrackReport(out, reports, warnings)
 
@@ -258,6 +262,8 @@ def _clip(head: HeadModel, betas: np.ndarray, track: _Track, size: int) -> Clip:
 
 def _write_pictures(
     writer: CollectionWriter,
+    head: HeadModel,
+    betas: np.ndarray,
     clip: Clip,
     track: _Track,
     cut_background: bool,
@@ -265,7 +271,7 @@ def _write_pictures(
     should_stop: ShouldStop | None,
 ) -> None:
     count = len(clip)
-    work = min(track.source.crop.side, 2 * clip.width)
+    work = min(track.source.crop.side, clip.width * 3 // 2)
     masks = None
     if cut_background:
         segmenter = matte.Segmenter()
@@ -277,6 +283,7 @@ def _write_pictures(
         finally:
             segmenter.close()
         masks = matte.steadied(masks)
+        np.maximum(masks, _skulls(head, betas, clip), out=masks)
     for row, picture in enumerate(_windows(track, work, should_stop)):
         if masks is None:
             rgba = np.concatenate([picture, np.ones_like(picture[..., :1])], axis=2)
@@ -285,6 +292,27 @@ def _write_pictures(
         rgba = matte.shrink(rgba, clip.width)
         writer.image(clip.name, int(clip.frame_id[row]), (rgba * 255 + 0.5).astype(np.uint8))
         tell(0.4 + 0.6 * row / count, step=f"writing {clip.name}")
+
+
+def _skulls(head: HeadModel, betas: np.ndarray, clip: Clip) -> np.ndarray:
+    """Where the fitted face and skull surely are, uint8 [F,256,256]: networks lose dark hair."""
+    masks = np.zeros((len(clip), matte.MASK_SIDE, matte.MASK_SIDE), np.uint8)
+    solid = np.zeros(head.vertex_count, bool)
+    for region in ("face", "scalp"):
+        if region in head.regions:
+            solid |= head.regions[region]
+    triangles = head.triangles[solid[head.triangles].all(axis=1)]
+    if len(triangles) == 0:
+        return masks
+    for row in range(len(clip)):
+        camera = Camera(clip.width, clip.height, clip.intrinsics[row], clip.camera_to_world[row])
+        one = slice(row, row + 1)
+        posed = head.pose(betas, clip.expression[one], clip.pose[one], clip.translation[one])
+        _, index, _ = rasterise(
+            posed[0].numpy(), triangles, camera.resized(matte.MASK_SIDE, matte.MASK_SIDE)
+        )
+        masks[row] = matte.eroded(index >= 0)
+    return masks
 
 
 def _windows(track: _Track, side: int, should_stop: ShouldStop | None) -> Iterator[np.ndarray]:
