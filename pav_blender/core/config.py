@@ -43,7 +43,7 @@ class Config:
 
     # deformation (paper, Personalized Deformable NeRF)
     frames: Literal["smooth", "affine", "rigid"] = "smooth"
-    occupancy_resolution: int = 160
+    occupancy_resolution: int = 128
     reach: float = 0.13  # metres from the mesh that the field may fill
 
     # optimisation (paper, Optimization and Implementation)
@@ -51,6 +51,7 @@ class Config:
     depth_weight: float = 10.0
     learning_rate: float = 2.5e-3
     offset_learning_rate: float = 2.5e-4
+    table_learning_rate: float = 1e-2  # of the hash encoding; the paper has one rate for all
     beta1: float = 0.9
     beta2: float = 0.99
     epsilon: float = 1e-15
@@ -80,7 +81,7 @@ class Config:
         return cls(
             frames="rigid",
             offset_sees_geometry=False,
-            offset_learning_rate=2.5e-4,
+            table_learning_rate=2.5e-3,
             final_learning_rate=1.0,
         )
 

@@ -14,6 +14,7 @@ from ..deformation import Clearance, Deformer, PosedMesh, clearance
 from ..deformation.rigid import head_rotation
 from ..errors import Cancelled, InputError
 from ..field.avatar import Avatar
+from ..kernels.cpu.threads import torch_alone
 from .cameras import Camera
 from .rays import RayBatch, camera_rays, pack, samples_of
 
@@ -163,7 +164,7 @@ def render(
     settings = settings or RenderSettings()
     if region is not None:
         camera = camera.window(*region)
-    with torch.inference_mode():
+    with torch.inference_mode(), torch_alone():
         scene = pose_scene(avatar, vertices, appearance, expression)
         count = camera.width * camera.height
         rgba = np.zeros((count, 4), np.float32)

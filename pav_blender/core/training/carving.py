@@ -18,18 +18,59 @@ from .frames import Frame
 
 _MISSES = 0.12  # part of the pictures that may disagree: mattes and tracks are not exact
 _INSIDE = 0.010  # metres below the skin where nothing is ever seen
+_REACH = {  # metres; regions that are not named may be covered by long hair
+    "torso": 0.05,
+    "face": 0.035,
+    "lips": 0.03,
+    "left_eye_region": 0.035,
+    "right_eye_region": 0.035,
+    "eyeballs": 0.03,
+    "mouth_interior": 0.02,
+}
 _SOFTNESS = 2  # pixels the mattes are grown by
 _LARGEST_STRETCH = 3.0
 
 
+def reach_of(regions: dict[str, np.ndarray], vertices: int, farthest: float) -> np.ndarray:
+    """Metres from each vertex [V] that anything may be: beards and glasses keep to the face,
+    clothes to the torso, hair may stand off the rest by `farthest`. What lies before a face no matte can carve.
+    """
+    reach = np.full(vertices, farthest, np.float32)
+    for name, distance in _REACH.items():
+        if name in regions:
+            reach[regions[name]] = min(distance, farthest)
+    return reach
+
+
+def close_to(
+    canonical: np.ndarray,
+    triangles: np.ndarray,
+    box_min: np.ndarray,
+    box_size: float,
+    cells: int,
+    distance: float,
+) -> np.ndarray:
+    """Cells [G, G, G] bool whose centre is within `distance` metres of the canonical mesh."""
+    centres = _centres(cells, box_min, box_size)
+    reach = np.full(len(canonical), distance, np.float32)
+    near = np.zeros(cells**3, bool)
+    near[_band(canonical, triangles, centres, reach).row] = True
+    return near.reshape((cells,) * 3)
+
+
+def _centres(cells: int, box_min: np.ndarray, box_size: float) -> np.ndarray:
+    grid = np.indices((cells,) * 3).reshape(3, -1).T
+    return ((grid + 0.5) * (box_size / cells) + box_min).astype(np.float32)
+
+
 def hull_box(
-    canonical: np.ndarray, triangles: np.ndarray, frames: list[Frame], reach: float
+    canonical: np.ndarray, triangles: np.ndarray, frames: list[Frame], reach: np.ndarray
 ) -> tuple[np.ndarray, float]:
     """Corner [3] and side, metres, of the cube that holds what the pictures show of the head.
 
     Shoulders that no camera sees need no cells.
     """
-    low, high = canonical.min(0) - reach, canonical.max(0) + reach
+    low, high = canonical.min(0) - reach.max(), canonical.max(0) + reach.max()
     cells = 48
     size = float((high - low).max())
     corner = (low + high) / 2 - size / 2
@@ -48,7 +89,7 @@ def carve(
     canonical: np.ndarray,
     triangles: np.ndarray,
     frames: list[Frame],
-    reach: float,
+    reach: np.ndarray,
     box_min: np.ndarray,
     box_size: float,
     cells: int,
@@ -57,11 +98,12 @@ def carve(
 ) -> np.ndarray:
     """Cells [G, G, G] bool that the mattes of `frames` (one appearance) leave.
 
+    reach [V]: metres from each vertex that anything may be.
+
     A cell that no frame has in its picture goes too: nothing there could be learned.
     """
     side = box_size / cells
-    centres = (np.indices((cells,) * 3).reshape(3, -1).T + 0.5) * side + box_min
-    band = _band(canonical, triangles, centres.astype(np.float32), reach + side)
+    band = _band(canonical, triangles, _centres(cells, box_min, box_size), reach + side)
     chosen = frames[:: max(1, -(-len(frames) // most_frames))]
     seen = np.zeros(len(band.row), np.int32)
     missed = np.zeros(len(band.row), np.int32)
@@ -89,7 +131,8 @@ def _band(canonical: np.ndarray, triangles: np.ndarray, points: np.ndarray, reac
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     foot = (corners * barycentric[:, :, None]).sum(1)
     inside = ((points - foot) * normal).sum(1) < 0
-    row = np.flatnonzero(distance <= np.where(inside, _INSIDE, reach))
+    allowed = (reach[triangles[triangle]] * barycentric).sum(1)
+    row = np.flatnonzero(distance <= np.where(inside, _INSIDE, allowed))
     return _Band(row, points[row], triangle[row])
 
 

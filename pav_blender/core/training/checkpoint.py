@@ -29,8 +29,7 @@ def save_checkpoint(path: Path, trainer: Trainer, source: str) -> None:
     }
     for name, (m, v) in trainer.moments.items():
         tensors[f"m.{name}"], tensors[f"v.{name}"] = m, v
-    tensors["occupied"] = torch.from_numpy(trainer.visibility.occupied)
-    tensors["weight"], tensors["looks"] = trainer.visibility.weight, trainer.visibility.looks
+    tensors |= {f"seen.{name}": value for name, value in trainer.visibility.state().items()}
     tensors["generator"] = trainer.generator.get_state()
     header = {
         "format": FORMAT,
@@ -69,7 +68,9 @@ def load_checkpoint(path: Path, trainer: Trainer, source: str) -> None:
         for name, (m, v) in trainer.moments.items():
             m.copy_(tensors[f"m.{name}"])
             v.copy_(tensors[f"v.{name}"])
-        trainer.visibility.restore(tensors["occupied"].numpy(), tensors["weight"], tensors["looks"])
+        trainer.visibility.restore(
+            {name[5:]: value for name, value in tensors.items() if name.startswith("seen.")}
+        )
         trainer.generator.set_state(tensors["generator"])
         trainer.random.bit_generator.state = header["random"]
         trainer.status = Status(**header["status"])

@@ -2,7 +2,7 @@
 
 The interior of a head never thins out by itself, since nothing behind an opaque surface has a
 gradient: so cells are emptied by what they add to pictures, not by their density. A cell that no
-ray could see keeps what it has.
+ray could see stays where it is near the mesh (the back of a head), and goes where it is not (fog).
 """
 
 from __future__ import annotations
@@ -15,48 +15,67 @@ from ..deformation import Clearance
 from ..rendering.render import clearance_of
 
 _SEEN = 0.1  # transmittance from which a look at a cell counts
-_LOOKS = 12.0  # looks a cell needs before it may be emptied
-_LEAST_WEIGHT = 4e-3
-_FORGET = 0.6
+_LOOKS = 8.0  # looks after which a cell is judged
+_LEAST_WEIGHT = 2e-3  # a millimetre; untrained fog has about twice that
+_HIDDEN = 12  # rounds without a look after which a cell counts as hidden
 
 
 class Visibility:
-    """Running largest weight and number of looks a cell, over all appearances."""
+    """What was seen of each cell since it was last judged, over all appearances.
 
-    def __init__(self, occupied: np.ndarray, box_min: np.ndarray, box_size: float) -> None:
+    occupied [A, G, G, G] bool is changed in place; near [G, G, G] bool: close to the mesh.
+    """
+
+    def __init__(
+        self, occupied: np.ndarray, near: np.ndarray, box_min: np.ndarray, box_size: float
+    ) -> None:
         self.occupied = occupied
+        self._near = near
         self._box = box_min, box_size
         self.weight = torch.zeros(occupied.size)
         self.looks = torch.zeros(occupied.size)
+        self.filled = torch.ones(occupied.size, dtype=torch.bool)
+        self.unseen = torch.zeros(occupied.size, dtype=torch.uint8)
         self.spaces: list[Clearance] = []
         self._refresh()
 
     def _refresh(self) -> None:
         self.spaces = [clearance_of(cells, *self._box) for cells in self.occupied]
 
-    def restore(self, occupied: np.ndarray, weight: torch.Tensor, looks: torch.Tensor) -> None:
+    def state(self) -> dict[str, torch.Tensor]:
+        """What an interrupted training must keep."""
+        return {
+            "occupied": torch.from_numpy(self.occupied),
+            "weight": self.weight,
+            "looks": self.looks,
+            "filled": self.filled,
+            "unseen": self.unseen,
+        }
+
+    def restore(self, state: dict[str, torch.Tensor]) -> None:
         """Takes up the state of an interrupted training, in place."""
-        self.occupied[:] = occupied
-        self.weight.copy_(weight)
-        self.looks.copy_(looks)
+        for name, tensor in self.state().items():
+            tensor.copy_(state[name])
         self._refresh()
 
     def watch(self, cells: torch.Tensor, seen: torch.Tensor, weights: torch.Tensor) -> None:
-        """Takes in the samples of a batch: cell [M], transmittance [M], weight [M]."""
+        """Takes in the samples of a batch: cell [M], transmittance [M], weight a millimetre [M]."""
         self.weight.scatter_reduce_(0, cells, weights, "amax")
         looked = cells[seen > _SEEN]
         self.looks.index_add_(0, looked, torch.ones(len(looked)))
 
     def prune(self) -> float:
-        """Empties what was looked at and added nothing; returns the part of the cells left."""
+        """Empties cells that were looked at and added nothing; returns the part that is left."""
+        judged = self.looks >= _LOOKS
+        self.filled[judged] = self.weight[judged] >= _LEAST_WEIGHT
+        self.unseen += (self.unseen < 255) & (self.looks == 0)
+        self.unseen[self.looks > 0] = 0
         shape = self.occupied.shape
-        weight = self.weight.numpy().reshape(shape)
-        looks = self.looks.numpy().reshape(shape)
-        filled = weight >= _LEAST_WEIGHT
-        for cells in filled:  # a neighbour may be what a surface moves into
-            ndimage.binary_dilation(cells, output=cells)
-        self.occupied &= filled | (looks < _LOOKS)
-        self.weight *= _FORGET
-        self.looks *= _FORGET
+        hidden = (self.unseen >= _HIDDEN).numpy().reshape(shape) & ~self._near
+        filled = self.filled.numpy().reshape(shape) & ~hidden
+        for index, cells in enumerate(filled):  # a surface may move into a neighbour
+            self.occupied[index] &= ndimage.binary_dilation(cells)
+        self.weight[judged] = 0
+        self.looks[judged] = 0
         self._refresh()
         return float(self.occupied.mean())

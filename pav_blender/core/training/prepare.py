@@ -9,7 +9,7 @@ from ..config import Config
 from ..errors import InputError
 from ..field.avatar import Avatar
 from ..progress import Report
-from .carving import carve, hull_box
+from .carving import carve, hull_box, reach_of
 from .frames import Frame, load_frames
 
 
@@ -37,7 +37,8 @@ def new_avatar(collection: Collection, frames: list[Frame], config: Config) -> A
     """An untrained avatar whose space is carved by the mattes of the frames."""
     head = collection.head
     canonical = head.canonical(collection.betas)
-    corner, size = hull_box(canonical, head.triangles, frames, config.reach)
+    reach = reach_of(head.regions, len(canonical), config.reach)
+    corner, size = hull_box(canonical, head.triangles, frames, reach)
     cells = config.occupancy_resolution
     coarse = -(-cells // 2)  # the hull is smooth: its cells may be twice as large
     hulls = [
@@ -45,7 +46,7 @@ def new_avatar(collection: Collection, frames: list[Frame], config: Config) -> A
             canonical,
             head.triangles,
             [f for f in frames if f.appearance == index],
-            config.reach,
+            reach,
             corner,
             size * 2 * coarse / cells,
             coarse,

@@ -11,6 +11,7 @@ from ..collection import Collection, read_collection
 from ..config import Config
 from ..errors import Cancelled, InputError
 from ..field.avatar import Avatar
+from ..kernels.cpu.threads import torch_alone
 from ..progress import Report
 from .checkpoint import checkpoint_path, load_checkpoint, save_checkpoint
 from .prepare import load_training_frames, new_avatar
@@ -53,7 +54,8 @@ def train(
         load_checkpoint(saved, trainer, source)
     last_saved = time.monotonic()
     while trainer.done < 1:
-        status = trainer.iterate()
+        with torch_alone():
+            status = trainer.iterate()
         if progress:
             progress(
                 trainer.done,

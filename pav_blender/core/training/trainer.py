@@ -14,20 +14,26 @@ from ..config import Config
 from ..deformation import Deformer
 from ..field.avatar import Avatar
 from .batches import Poses, draw_pixels, pick_samples
+from .carving import close_to
 from .frames import Frame
 from .losses import Loss, losses
 from .occupancy import Visibility
 
-_FIRST_STEP = 3.0  # the first samples are this many times as far apart as the last
-_REFINED = 0.15  # part of the schedule after which the step is fine
-_PRUNE_FROM = 200
-_PRUNE_EVERY = 100
-_WARM_UP = 50
+_FIRST_STEP = 8.0  # the first samples are this many times as far apart as the last
+_LOOKS_A_RAY = 32  # the step is as fine as this many looks a ray allow,
+_REFINED = 0.6  # up to this part of the schedule; from then on it is the finest
+_LOOKS = 1 << 16  # a batch has fewer rays while space is still full of fog
+_CARVED = 0.2  # part of the schedule in which space is emptied often
+_PRUNE_EVERY = 40  # iterations, while there is much to empty
+_PRUNE_LATER = 400
+_UNSEEN_REACH = 0.015  # metres from the mesh within which cells that no ray saw are kept
+_WARM_UP = 20
 
 
 @dataclass
 class Status:
-    """Where training stands: smoothed loss and PSNR of the batches, samples a ray."""
+    """Where training stands: smoothed loss and PSNR of the batches, samples a ray, part of the
+    space that is left, and the next batch's step (metres) and rays."""
 
     iteration: int = 0
     seconds: float = 0.0
@@ -35,6 +41,8 @@ class Status:
     psnr: float = 0.0
     samples_per_ray: float = 0.0
     filled: float = 1.0
+    step: float = 1e-3
+    rays: int = 1
 
 
 class Trainer:
@@ -47,10 +55,18 @@ class Trainer:
         self.frames = frames
         self.minutes = minutes
         self.config: Config = avatar.config
-        self.status = Status()
+        self.status = Status(step=_FIRST_STEP * self.config.step, rays=self.config.rays // 4)
         self.random = np.random.default_rng(self.config.seed)
         self.generator = torch.Generator().manual_seed(self.config.seed)
-        self.visibility = Visibility(avatar.occupied, avatar.box_min, avatar.box_size)
+        box = avatar.box_min, avatar.box_size
+        near = close_to(
+            avatar.canonical_vertices,
+            avatar.triangles,
+            *box,
+            self.config.occupancy_resolution,
+            _UNSEEN_REACH,
+        )
+        self.visibility = Visibility(avatar.occupied, near, *box)
         deformer = Deformer(avatar.canonical_vertices, avatar.triangles, self.config.frames)
         self._poses = Poses(deformer, avatar.canonical_vertices, avatar.rigid_weights)
         self._by_appearance = [
@@ -75,9 +91,9 @@ class Trainer:
         """One iteration: batch, loss, backward, Adam; the occupancy now and then."""
         started = time.monotonic()
         config, status = self.config, self.status
-        pixels = draw_pixels(self._choose_frames(), config.rays, self.random)
+        pixels = draw_pixels(self._choose_frames(), status.rays, self.random)
         count = len(pixels.rays)
-        step = config.step * self._coarseness()
+        step = status.step
         jitter = torch.rand(count, generator=self.generator)
         with torch.no_grad():
             picked = pick_samples(
@@ -89,7 +105,8 @@ class Trainer:
                 step,
                 jitter,
             )
-            self.visibility.watch(picked.cells, picked.transmittance, picked.weights)
+            per_millimetre = picked.weights / (1e3 * step)
+            self.visibility.watch(picked.cells, picked.transmittance, per_millimetre)
         ops = kernels.select("cpu")
         sigma, rgb = self.avatar.field(picked.samples)
         colour, opacity, depth, _ = ops.marching.composite(
@@ -101,9 +118,10 @@ class Trainer:
             loss.total.backward()
             self._adam()
         status.iteration += 1
-        if status.iteration >= _PRUNE_FROM and status.iteration % self._prune_every() == 0:
+        if self._prunes_now():
             status.filled = self.visibility.prune()
         self._note(loss, len(picked.t) / max(count, 1))
+        self._plan(len(picked.cells), count)
         status.seconds += time.monotonic() - started
         return status
 
@@ -118,11 +136,24 @@ class Trainer:
             )
         ]
 
-    def _coarseness(self) -> float:
-        return max(1.0, _FIRST_STEP * (1 / _FIRST_STEP) ** min(1.0, self.done / _REFINED))
+    def _plan(self, looks: int, rays: int) -> None:
+        """Sets the next batch's step and size from what the last one looked at.
 
-    def _prune_every(self) -> int:
-        return _PRUNE_EVERY if self.status.iteration < 10 * _PRUNE_EVERY else 5 * _PRUNE_EVERY
+        While nothing is known of where the head ends, a ray passes much fog: few rays of few samples
+        find out as well, and far sooner.
+        """
+        status, config = self.status, self.config
+        a_ray = looks / max(rays, 1)
+        if self.done < _REFINED:
+            wanted = status.step / config.step * (max(a_ray, 1.0) / _LOOKS_A_RAY) ** 0.2
+            status.step = config.step * min(max(wanted, 1.0), _FIRST_STEP)
+        else:
+            status.step = config.step
+        status.rays = int(min(max(_LOOKS / max(a_ray, 1.0), config.rays / 4), config.rays))
+
+    def _prunes_now(self) -> bool:
+        often = self.done < _CARVED or self.status.iteration < 10 * _PRUNE_EVERY
+        return self.status.iteration % (_PRUNE_EVERY if often else _PRUNE_LATER) == 0
 
     def _adam(self) -> None:
         config = self.config
@@ -130,9 +161,10 @@ class Trainer:
         step = self.status.iteration + 1
         decay = config.final_learning_rate**self.done * min(1.0, step / _WARM_UP)
         for name, parameter in self.avatar.field.named_parameters():
-            base = (
-                config.offset_learning_rate if name.startswith("offset") else config.learning_rate
-            )
+            base = {
+                "offset": config.offset_learning_rate,
+                "tables": config.table_learning_rate,
+            }.get(name.partition(".")[0], config.learning_rate)
             m, v = self.moments[name]
             settings = {
                 "step": step,
