@@ -28,6 +28,8 @@ OVAL = (
 )  # fmt: skip
 RIGHT_IRIS = (468, 469, 470, 471, 472)
 LEFT_IRIS = (473, 474, 475, 476, 477)
+# forehead, temples, eye corners, bridge of the nose: they move with the skull
+RIGID = (10, 338, 297, 332, 284, 251, 109, 67, 103, 54, 21, 33, 133, 362, 263, 6, 168, 197)
 # upper lid, lower lid, outer corner, inner corner
 RIGHT_OPENING, LEFT_OPENING = (159, 145, 33, 133), (386, 374, 263, 362)
 

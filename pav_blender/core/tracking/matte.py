@@ -19,6 +19,9 @@ from .observe import INSTALL, load_mediapipe, quiet
 
 MASK_SIDE = 256
 _FLOOR = 0.2  # the network's edge is softer than hair is, and never quite sure
+_VOTERS = 24
+_ALIKE = 0.08  # radians between turns of the head at which outlines still compare
+_HAIR = 14  # pixels of a mask that short hair may stand off the skull
 _SAFETY = 3  # pixels of a mask that a fitted head may be wrong by
 
 
@@ -57,6 +60,49 @@ def steadied(masks: np.ndarray) -> np.ndarray:
     """uint8 [F,256,256] -> each averaged with its two neighbours (1, 2, 1), uint8."""
     padded = np.concatenate([masks[:1], masks, masks[-1:]]).astype(np.uint16)
     return ((padded[:-2] + 2 * padded[1:-1] + padded[2:] + 2) // 4).astype(np.uint8)
+
+
+def agreed(
+    masks: np.ndarray, poses: np.ndarray, points: np.ndarray, skulls: np.ndarray
+) -> np.ndarray:
+    """Gives hair back that the network lost in some frames: uint8 [F,256,256].
+
+    poses [F,3]: the head's turn, axis-angle; points [F,N,2]: places that move with the skull, in
+    mask pixels; skulls uint8 [F,256,256]: the fitted skull's outline. Frames in which the head is
+    turned alike are laid over one another; what most of them call person close to the skull is
+    raised to what they agree on. Long hair, which swings, is out of reach.
+    """
+    spread = np.linspace(0, len(masks) - 1, min(len(masks), _VOTERS)).astype(int)
+    voters = torch.from_numpy(masks[spread].astype(np.float32) / 255)[:, None]
+    out = masks.copy()
+    for row in range(len(masks)):
+        away = np.linalg.norm(poses[spread] - poses[row], axis=1)
+        weights = np.exp(-0.5 * (away / _ALIKE) ** 2) + 1e-6
+        maps = np.stack([_similarity(points[row], points[voter]) for voter in spread])
+        grid = functional.affine_grid(
+            torch.from_numpy(maps.astype(np.float32)), list(voters.shape), align_corners=False
+        )
+        votes = functional.grid_sample(voters, grid, padding_mode="border", align_corners=False)
+        share = torch.from_numpy((weights / weights.sum()).astype(np.float32))
+        agreed_on = (votes[:, 0] * share[:, None, None]).sum(0).numpy()
+        skull = torch.from_numpy(skulls[row].astype(np.float32) / 255)[None]
+        near = _widest(skull, _HAIR)[0].numpy() > 0
+        sure = ((agreed_on - 0.4) / 0.4).clip(0, 1)
+        raised = np.maximum(out[row], (sure * 255 + 0.5).astype(np.uint8))
+        out[row] = np.where(near, raised, out[row])
+    return out
+
+
+def _similarity(to: np.ndarray, of: np.ndarray) -> np.ndarray:
+    """[2,3]: from places about `to` [N,2] to those about `of`, in a sampling grid's units."""
+    centre = MASK_SIDE / 2
+    a, b = (to - centre) / centre, (of - centre) / centre
+    middle_a, middle_b = a.mean(axis=0), b.mean(axis=0)
+    p = (a - middle_a) @ [1, 1j]
+    q = (b - middle_b) @ [1, 1j]
+    factor = (p.conj() @ q) / max(float((np.abs(p) ** 2).sum()), 1e-12)
+    linear = np.array([[factor.real, -factor.imag], [factor.imag, factor.real]])
+    return np.concatenate([linear, (middle_b - linear @ middle_a)[:, None]], axis=1)
 
 
 def eroded(solid: np.ndarray) -> np.ndarray:

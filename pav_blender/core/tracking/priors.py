@@ -23,7 +23,7 @@ from .observe import LANDMARKS
 # of them tell about as much as this share of them would.
 SCATTER = 0.006
 INDEPENDENT = 0.2
-SCORE_SPREAD = 0.2
+SCORE_SPREAD = 0.3
 # Landmarks hardly tell a near head under a wide lens from a far one under a long lens. Two guesses
 # are weighed: a portrait's field of view (some 42 degrees, unless the video was cropped before)
 # and the distance one is filmed from; spreads are of logarithms.
@@ -148,11 +148,12 @@ def expected_expression(
 
 
 def landmark_weights() -> np.ndarray:
-    """How much each landmark says, [478]: lips and lids most, the face's sliding outline least."""
+    """How much each landmark says, [478]: lips and lids, whose mistakes are seen, most; the face's
+    sliding outline least."""
     weights = np.full(LANDMARKS, 0.6)
-    weights[list(LIPS)] = 2.0
-    weights[[*LEFT_LIDS, *RIGHT_LIDS]] = 2.0
-    weights[[*LEFT_IRIS, *RIGHT_IRIS]] = 2.0
+    weights[list(LIPS)] = 8.0
+    weights[[*LEFT_LIDS, *RIGHT_LIDS]] = 4.0
+    weights[[*LEFT_IRIS, *RIGHT_IRIS]] = 4.0
     weights[list(OVAL)] = 0.25
     return weights
 

@@ -19,6 +19,7 @@ from . import matte
 from .crop import Crop, content_box, cut, plan_crop
 from .decode import Frame, Video, open_video
 from .fit import ClipFit, fit_head, world
+from .landmark_model import RIGID
 from .observe import Observations, make_detector, observe
 
 ShouldStop = Callable[[], bool]
@@ -282,8 +283,7 @@ def _write_pictures(
                 tell(0.4 * row / count, step=f"cutting out {clip.name}")
         finally:
             segmenter.close()
-        masks = matte.steadied(masks)
-        np.maximum(masks, _skulls(head, betas, clip), out=masks)
+        masks = _mended(matte.steadied(masks), head, betas, clip, track)
     for row, picture in enumerate(_windows(track, work, should_stop)):
         if masks is None:
             rgba = np.concatenate([picture, np.ones_like(picture[..., :1])], axis=2)
@@ -292,6 +292,18 @@ def _write_pictures(
         rgba = matte.shrink(rgba, clip.width)
         writer.image(clip.name, int(clip.frame_id[row]), (rgba * 255 + 0.5).astype(np.uint8))
         tell(0.4 + 0.6 * row / count, step=f"writing {clip.name}")
+
+
+def _mended(
+    masks: np.ndarray, head: HeadModel, betas: np.ndarray, clip: Clip, track: _Track
+) -> np.ndarray:
+    """The masks with the hair and the skull that the network lost."""
+    crop = track.source.crop
+    places = track.source.seen.landmarks[track.rows][:, RIGID, :2].astype(np.float64)
+    places = (places - crop.corners[track.rows][:, None]) * (matte.MASK_SIDE / crop.side)
+    skulls = _skulls(head, betas, clip)
+    turns = track.fit.pose[:, 1 if len(head.joint_names) > 1 else 0]
+    return np.maximum(matte.agreed(masks, turns, places, skulls), skulls)
 
 
 def _skulls(head: HeadModel, betas: np.ndarray, clip: Clip) -> np.ndarray:
