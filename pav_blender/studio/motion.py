@@ -10,6 +10,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from ..core.head import HeadModel
 
+BLOCK = 60  # frames are planned in blocks of this many
 FRAMES_PER_BEAT = 5.0  # a clip is watched at about 10 pictures a second
 
 # One-sided names stand for both sides.
@@ -52,7 +53,7 @@ class Motion:
 
 def perform(head: HeadModel, frames: int, rng: np.random.Generator) -> Motion:
     """A performance of `frames` pictures; covers turns to both sides and a wide range of faces."""
-    count = max(frames, 2)
+    count = BLOCK * -(-frames // BLOCK)  # a shorter clip is the beginning of a longer one
     expression = np.zeros((count, len(head.expression_names)))
     for recipes, beat, gain in ((MOODS, 1.6, 1.0), (VISEMES, 0.7, 1.0)):
         for name, values in _speech(recipes, count, beat, rng).items():

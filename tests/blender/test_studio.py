@@ -168,6 +168,7 @@ def test_the_committed_collection_renders_again():
     """Two frames of the default collection: the parameters exactly, the pictures closely."""
     collection = read_collection(DEFAULT)
     extra = collection.extra
+    assert extra["head_fingerprint"] == collection.head.fingerprint
     person = build_person(collection.head, identity(collection.head, extra["seed"]))
     np.testing.assert_array_equal(np.round(person.betas, 6), np.round(collection.betas, 6))
     for number, row in ((0, 5), (2, 20)):
@@ -185,3 +186,11 @@ def test_the_committed_collection_renders_again():
         assert 10 * np.log10(255**2 / max(error, 1e-9)) > 35
         assert np.abs(stored[..., 3] - mine[..., 3]).mean() < 1.0
         assert (picture.labels == read_gray(collection.labels_path(clip, row))).mean() > 0.99
+
+
+def test_a_short_performance_begins_a_longer_one(person):
+    short = motion.perform(person.head, 12, np.random.default_rng(3))
+    longer = motion.perform(person.head, 54, np.random.default_rng(3))
+    np.testing.assert_array_equal(short.expression, longer.expression[:12])
+    np.testing.assert_array_equal(short.pose, longer.pose[:12])
+    assert np.abs(np.diff(longer.pose[:, 1], axis=0)).max() < np.radians(20)  # no jumps
