@@ -45,8 +45,6 @@ def configure(scene, size: int) -> None:
     cycles.sample_clamp_indirect = 3.0
     cycles.caustics_reflective = cycles.caustics_refractive = False
     cycles.use_light_tree = False
-    cycles.denoiser = "OPENIMAGEDENOISE"
-    cycles.denoising_prefilter = "FAST"
     cycles.adaptive_threshold = 0.05
     scene.cycles_curves.shape = "RIBBONS"
     scene.cycles_curves.subdivisions = 1
@@ -65,7 +63,11 @@ class Passes:
         self.scene = scene
         configure(scene, size)
         self.samples = samples or (COLOUR_SAMPLES if size <= 320 else 24)
+        # Debian's Blender has no denoiser: more samples take its place
         self.denoise = bool(getattr(_cycles(), "with_openimagedenoise", False))
+        if self.denoise:
+            scene.cycles.denoiser = "OPENIMAGEDENOISE"
+            scene.cycles.denoising_prefilter = "FAST"
         self.flat, graph = new_material("studio flat")
         graph.surface(
             graph.add("Emission", Color=graph.attribute("label").outputs[0], Strength=1.0)

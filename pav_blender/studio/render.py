@@ -166,13 +166,12 @@ def filming(
     person: Person, look: Appearance, size: int, seed: int, samples: int | None = None
 ) -> Iterator[Callable[[Shot], Picture]]:
     """Builds the appearance's scene; yields a function that takes one picture."""
-    studio = build_scene(person, look, seed)
-    passes = Passes(studio.scene, size, samples)
-    try:
+    with contextlib.ExitStack() as stack:
+        studio = build_scene(person, look, seed)
+        stack.callback(studio.close)
+        passes = Passes(studio.scene, size, samples)
+        stack.callback(passes.close)
         yield lambda shot: _take(studio, passes, shot, size)
-    finally:
-        passes.close()
-        studio.close()
 
 
 def _take(studio: StudioScene, passes: Passes, shot: Shot, size: int) -> Picture:
