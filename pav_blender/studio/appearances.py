@@ -101,8 +101,8 @@ APPEARANCES = (
                  roughness=0.42, under_hair=(0.055, 0.038, 0.03), under_beard=(0.09, 0.055, 0.04)),
         Lighting(
             (
-                AreaLight(-62, 18, 30, 0.35, colour=(1.0, 0.93, 0.85)),
-                AreaLight(70, 12, 15, 0.4, colour=(0.65, 0.80, 1.0)),
+                AreaLight(-62, 18, 30, 0.55, colour=(1.0, 0.93, 0.85)),
+                AreaLight(70, 12, 10, 0.7, colour=(0.65, 0.80, 1.0)),
                 AreaLight(10, 60, 8, 0.8),
             ),
             zenith=(0.30, 0.34, 0.40), ground=(0.10, 0.09, 0.09), sky=0.6,

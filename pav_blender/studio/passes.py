@@ -45,7 +45,6 @@ def configure(scene, size: int) -> None:
     cycles.sample_clamp_indirect = 3.0
     cycles.caustics_reflective = cycles.caustics_refractive = False
     cycles.use_light_tree = False
-    cycles.adaptive_threshold = 0.05
     scene.cycles_curves.shape = "RIBBONS"
     scene.cycles_curves.subdivisions = 1
 
@@ -84,6 +83,7 @@ class Passes:
         cycles.samples = self.samples if self.denoise else 8 * self.samples
         cycles.use_denoising = self.denoise
         cycles.use_adaptive_sampling = True
+        cycles.adaptive_threshold = 0.05 if self.denoise else 0.015
         cycles.filter_width = 1.5
         return self._render()["Combined"]
 
