@@ -84,7 +84,9 @@ def test_fit_finds_the_pixels_it_was_given_without_their_noise(head, fitted):
     truths, _, fit = fitted
     for truth, clip in zip(truths, fit.clips, strict=True):
         clean = _seen(head, truth, noise=0).landmarks[..., :2]
-        missed = np.linalg.norm(_pixels(_points(head, fit, clip).points, clip.focal) - clean, axis=2)
+        missed = np.linalg.norm(
+            _pixels(_points(head, fit, clip).points, clip.focal) - clean, axis=2
+        )
         assert np.median(missed) < 0.5
         assert np.percentile(missed, 95) < 2
 
@@ -147,7 +149,7 @@ def test_a_shaking_detector_does_not_shake_the_head(head):
 
 
 def test_the_world_shows_the_same_picture(head, fitted):
-    _, seen, fit = fitted
+    _, _, fit = fitted
     clip = fit.clips[0]
     moved, camera = world(head, fit.betas, clip)
     intrinsics = np.array([[clip.focal, 0, SIDE / 2], [0, clip.focal, SIDE / 2], [0, 0, 1]])

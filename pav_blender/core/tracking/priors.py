@@ -74,7 +74,7 @@ _JOINTS = {
 # what landmarks hardly show, and would be used to mend the identity
 _UNSEEN = {"cheekPuff": 0.1, "tongueOut": 0.02, "jawForward": 0.1}
 _OTHER_JOINT = (0.0, (0.05, 0.05, 0.05), 0.02)
-_TRANSLATION_JITTER = (0.0008, 0.0008, 0.003)
+_TRANSLATION_JITTER = (0.0006, 0.0006, 0.002)
 
 
 def is_blend_shapes(head: HeadModel) -> bool:
