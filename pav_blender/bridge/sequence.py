@@ -136,9 +136,9 @@ def read_frame(scene_name: str, frame: int) -> Shot:
 
     scene = bpy.data.scenes[scene_name]
     scene.frame_set(frame)
-    depsgraph = scene.view_layers[0].depsgraph
-    depsgraph.update()
-    return read_shot(None, depsgraph)
+    layer = scene.view_layers[0]
+    layer.update()
+    return read_shot(None, layer.depsgraph)
 
 
 def display(shot: Shot, pixels: Pixels) -> np.ndarray:

@@ -30,6 +30,16 @@ class Actor:
     rigid: np.ndarray
     scale: float
 
+    def equals(self, other: Actor) -> bool:
+        """Whether both would give the same picture."""
+        return (
+            (self.avatar, self.appearance, self.expression, self.scale)
+            == (other.avatar, other.appearance, other.expression, other.scale)
+            and np.array_equal(self.rigid, other.rigid)
+            and np.array_equal(self.vertices, other.vertices)
+            and np.array_equal(self.triangles, other.triangles)
+        )
+
     def seen_by(self, camera: Camera) -> Camera:
         """A camera of the world as it stands to the head's own space."""
         pose = np.linalg.inv(self.rigid) @ camera.camera_to_world

@@ -52,16 +52,24 @@ class View:
     _next: int = field(default=0)
 
     def update(self, depsgraph: Any) -> None:
-        """Takes a copy of what is to be drawn."""
-        self.changed, self.message = True, ""
+        """Takes a copy of what is to be drawn. Blender calls this for every edit of the file; one
+        that does not concern the picture changes nothing."""
+        message, actors = "", ()
         try:
             requirements.check()
-            self.actors = find_actors(depsgraph)
-            self.background = film_background(depsgraph.scene_eval)
-            if not self.actors:
-                self.message = "No avatar in view: choose an avatar file in the PAV tab"
+            actors = find_actors(depsgraph)
+            if not actors:
+                message = "No avatar in view: choose an avatar file in the PAV tab"
         except PavError as error:
-            self.actors, self.message = (), str(error)
+            message = str(error)
+        background = film_background(depsgraph.scene_eval)
+        alike = len(actors) == len(self.actors) and all(
+            one.equals(other) for one, other in zip(actors, self.actors, strict=True)
+        )
+        if alike and background == self.background and not (message or self.message):
+            return
+        self.actors, self.background, self.message = actors, background, message
+        self.changed = True
 
     def look(self, camera: Camera) -> None:
         """Brings the picture to the camera: nothing if it has it, else the coarse one now and the

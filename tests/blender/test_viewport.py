@@ -154,6 +154,34 @@ def test_a_fault_becomes_the_views_message(renderer, monkeypatch):
     assert view.pixels is None
 
 
+def test_an_edit_elsewhere_keeps_the_picture(scene, renderer, tmp_path):
+    import bpy
+    import small
+
+    from pav_blender.bridge.scene import build_head
+
+    rig = build_head(small.write_avatar(tmp_path / "small.pav"))
+    view = viewport.View()
+
+    def sizes_after_update():
+        bpy.context.view_layer.update()
+        view.update(bpy.context.evaluated_depsgraph_get())
+        view.look(camera())
+        return len(renderer.sizes)
+
+    assert sizes_after_update() == 1
+    rig.mesh.select_set(True)
+    assert sizes_after_update() == 1
+    rig.mesh.data.shape_keys.key_blocks["jawOpen"].value = 0.4
+    assert sizes_after_update() == 2
+    rig.mesh.pav.appearance = "evening"
+    assert sizes_after_update() == 3
+    rig.armature.location.x = 0.1
+    assert sizes_after_update() == 4
+    scene.render.film_transparent = not scene.render.film_transparent
+    assert sizes_after_update() == 5
+
+
 def test_update_without_an_avatar_says_so(scene):
     import bpy
 

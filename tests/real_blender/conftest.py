@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 
@@ -25,17 +26,25 @@ class RealBlender:
     def __init__(self, command: str) -> None:
         self.command = shlex.split(command)
 
-    def __call__(self, *arguments: object, timeout: float = 300) -> subprocess.CompletedProcess:
+    def __call__(self, *arguments: object, timeout: float = 600) -> subprocess.CompletedProcess:
         # settings of its own: the user's Blender stays as it is
         environment = {**os.environ, "BLENDER_USER_RESOURCES": str(WORK / "resources")}
-        return subprocess.run(
-            [*self.command, *map(str, arguments)],
+        command = [*self.command, *map(str, arguments)]
+        child = subprocess.Popen(
+            command,
             cwd=ROOT,
             env=environment,
-            capture_output=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
             text=True,
-            timeout=timeout,
+            start_new_session=True,
         )
+        try:
+            out, err = child.communicate(timeout=timeout)
+        finally:
+            if child.poll() is None:  # a wrapper's children go with it
+                os.killpg(child.pid, signal.SIGKILL)
+        return subprocess.CompletedProcess(command, child.returncode, out, err)
 
 
 @pytest.fixture(scope="session")
