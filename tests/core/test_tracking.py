@@ -327,17 +327,17 @@ def test_masks_waver_less_after_steadying():
 def test_hair_lost_in_one_frame_comes_back_where_the_head_is_then():
     frames = 8
     masks = np.zeros((frames, 256, 256), np.uint8)
-    skulls = np.zeros_like(masks)
+    scalps = np.zeros_like(masks)
     ring = np.stack([np.cos(np.arange(9)), np.sin(np.arange(9))], 1) * 40
     points = np.empty((frames, 9, 2))
     for row in range(frames):
         shift = 3 * row
         masks[row] = np.roll(255 * (_disc(256, 70) > 0.5), shift, axis=1)
-        skulls[row] = np.roll(255 * (_disc(256, 62) > 0.5), shift, axis=1)
+        scalps[row] = np.roll(255 * (_disc(256, 62) > 0.5), shift, axis=1)
         points[row] = ring + np.array([128 + shift, 128])
     whole = masks.copy()
     masks[3, :100] = 0
-    mended = matte.agreed(masks, np.zeros((frames, 3)), points, skulls)
+    mended = matte.agreed(masks, np.zeros((frames, 3)), points, scalps)
     lost = (whole[3] > 0) & (masks[3] == 0)
     assert (mended[3][lost] > 200).mean() > 0.9
     assert (mended[3][whole[3] == 0] > 100).mean() < 0.01

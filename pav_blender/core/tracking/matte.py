@@ -21,7 +21,8 @@ MASK_SIDE = 256
 _FLOOR = 0.2  # the network's edge is softer than hair is, and never quite sure
 _VOTERS = 24
 _ALIKE = 0.08  # radians between turns of the head at which outlines still compare
-_HAIR = 14  # pixels of a mask that short hair may stand off the skull
+_HAIR = 12  # pixels of a mask that short hair may stand off the scalp
+_MISLAID = 1
 _SAFETY = 3  # pixels of a mask that a fitted head may be wrong by
 
 
@@ -63,13 +64,13 @@ def steadied(masks: np.ndarray) -> np.ndarray:
 
 
 def agreed(
-    masks: np.ndarray, poses: np.ndarray, points: np.ndarray, skulls: np.ndarray
+    masks: np.ndarray, poses: np.ndarray, points: np.ndarray, scalps: np.ndarray
 ) -> np.ndarray:
     """Gives hair back that the network lost in some frames: uint8 [F,256,256].
 
     poses [F,3]: the head's turn, axis-angle; points [F,N,2]: places that move with the skull, in
-    mask pixels; skulls uint8 [F,256,256]: the fitted skull's outline. Frames in which the head is
-    turned alike are laid over one another; what most of them call person close to the skull is
+    mask pixels; scalps uint8 [F,256,256]: where the fitted scalp is seen. Frames in which the head
+    is turned alike are laid over one another; what most of them call person close to the scalp is
     raised to what they agree on. Long hair, which swings, is out of reach.
     """
     spread = np.linspace(0, len(masks) - 1, min(len(masks), _VOTERS)).astype(int)
@@ -84,10 +85,12 @@ def agreed(
         )
         votes = functional.grid_sample(voters, grid, padding_mode="border", align_corners=False)
         share = torch.from_numpy((weights / weights.sum()).astype(np.float32))
-        agreed_on = (votes[:, 0] * share[:, None, None]).sum(0).numpy()
-        skull = torch.from_numpy(skulls[row].astype(np.float32) / 255)[None]
-        near = _widest(skull, _HAIR)[0].numpy() > 0
-        sure = ((agreed_on - 0.4) / 0.4).clip(0, 1)
+        mean = (votes[:, 0] * share[:, None, None]).sum(0, keepdim=True)
+        # outlines laid over one another miss by some pixels: only what lies within all the same
+        agreed_on = -_widest(-mean, _MISLAID)[0].numpy()
+        scalp = torch.from_numpy(scalps[row].astype(np.float32) / 255)[None]
+        near = _widest(scalp, _HAIR)[0].numpy() > 0
+        sure = ((agreed_on - 0.45) / 0.4).clip(0, 1)
         raised = np.maximum(out[row], (sure * 255 + 0.5).astype(np.uint8))
         out[row] = np.where(near, raised, out[row])
     return out

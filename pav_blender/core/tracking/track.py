@@ -301,16 +301,19 @@ def _mended(
     crop = track.source.crop
     places = track.source.seen.landmarks[track.rows][:, RIGID, :2].astype(np.float64)
     places = (places - crop.corners[track.rows][:, None]) * (matte.MASK_SIDE / crop.side)
-    skulls = _skulls(head, betas, clip)
+    scalps = _silhouettes(head, betas, clip, ("scalp",))
+    skulls = _silhouettes(head, betas, clip, ("face", "scalp"))
     turns = track.fit.pose[:, 1 if len(head.joint_names) > 1 else 0]
-    return np.maximum(matte.agreed(masks, turns, places, skulls), skulls)
+    return np.maximum(matte.agreed(masks, turns, places, scalps), skulls)
 
 
-def _skulls(head: HeadModel, betas: np.ndarray, clip: Clip) -> np.ndarray:
-    """Where the fitted face and skull surely are, uint8 [F,256,256]: networks lose dark hair."""
+def _silhouettes(
+    head: HeadModel, betas: np.ndarray, clip: Clip, regions: tuple[str, ...]
+) -> np.ndarray:
+    """Where the fitted head's regions surely are, uint8 [F,256,256]."""
     masks = np.zeros((len(clip), matte.MASK_SIDE, matte.MASK_SIDE), np.uint8)
     solid = np.zeros(head.vertex_count, bool)
-    for region in ("face", "scalp"):
+    for region in regions:
         if region in head.regions:
             solid |= head.regions[region]
     triangles = head.triangles[solid[head.triangles].all(axis=1)]
