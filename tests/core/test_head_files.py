@@ -1,5 +1,7 @@
 """Head files: round trips, and what is wrong with malformed ones."""
 
+import os
+
 import numpy as np
 import pytest
 from test_head_pose import SMALL
@@ -49,6 +51,14 @@ def test_failed_write_keeps_the_old_file(tmp_path, monkeypatch):
         write_head(path, SMALL)
     assert path.read_bytes() == before
     assert len(list(tmp_path.iterdir())) == 1
+
+
+@pytest.mark.skipif(os.name != "posix", reason="modes of posix files")
+def test_written_file_has_the_mode_of_any_new_file(tmp_path):
+    write_head(tmp_path / "head.npz", SMALL)
+    (tmp_path / "plain").touch()
+    modes = {path.name: path.stat().st_mode for path in tmp_path.iterdir()}
+    assert modes["head.npz"] == modes["plain"]
 
 
 def test_load_head_by_name_or_path(tmp_path):

@@ -8,10 +8,7 @@ from tools.builtin_head.cut import Cut
 from tools.builtin_head.rig import Rig
 
 _EYE_REACH = 0.021  # metres from an eye's centre, seen from the front
-# The hairline behind, heights against the eyes, metres: from the nape (further back than the first
-# z) it rises to the ears (further forward than the second)
-_NAPE, _EARS = -0.05, -0.02
-_NAPE_Z, _EARS_Z = -0.13, -0.09
+_NECK_TOP = -0.05  # metres below the eyes: the hairline at the nape
 
 
 def build_regions(
@@ -34,7 +31,7 @@ def build_regions(
     neck_share = rig.weights[:, 1] + rig.weights[:, 2]
     face = painted["face"] & ~painted["ears"]
     skin = head & ~painted["ears"]
-    below = template[:, 1] < np.interp(template[:, 2], (_NAPE_Z, _EARS_Z), (_NAPE, _EARS))
+    below = template[:, 1] < _NECK_TOP
     neck = (skin | of_island("torso")) & ~face & below & (neck_share > 0.08)
     regions = {
         "face": face,

@@ -7,7 +7,7 @@ stored as int16 multiples of a step in metres (``<basis>_step``), which packs to
 from __future__ import annotations
 
 import os
-import tempfile
+import uuid
 import zipfile
 from dataclasses import fields
 from pathlib import Path
@@ -50,13 +50,14 @@ def write_head(path: str | Path, head: HeadModel, *, step: float | None = None) 
         for name in _QUANTISED:
             content[name] = _quantise(name, content[name], step)
             content[name + "_step"] = np.array(step, np.float32)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".partial")
+    # not mkstemp, which would leave a file that only its owner may read
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.partial")
     try:
-        with os.fdopen(handle, "wb") as stream:
+        with temporary.open("xb") as stream:
             np.savez_compressed(stream, **content)  # type: ignore[arg-type]
         os.replace(temporary, path)
     except BaseException:
-        Path(temporary).unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
         raise
 
 
