@@ -279,7 +279,8 @@ def search(boxes, starts, records, px, py, pz, best, found, stack, scratch):
     """Squared distance and slot of the triangle nearest to each point (all must be finite).
 
     `best`, `found` hold what is known: a bound that is certain to be reached (or infinity), and the
-    slot it came from or -1. Only what is closer than `best` replaces it.
+    slot it came from or -1. Only what is closer than `best` replaces it, or as close in an earlier
+    slot: the answer does not depend on the way there.
     """
     lx, hx = splat(smallest(px)), splat(largest(px))
     ly, hy = splat(smallest(py)), splat(largest(py))
@@ -322,10 +323,11 @@ def search(boxes, starts, records, px, py, pz, best, found, stack, scratch):
                 continue
             slot = node * LANES + child
             squared = measure(records, slot, px, py, pz)
-            closer = squared < best
+            here = splat_int(slot)
+            closer = (squared < best) | ((squared == best) & (here < found))
             if bits(closer) != 0:
                 best = select(closer, squared, best)
-                found = select(closer, splat_int(slot), found)
+                found = select(closer, here, found)
                 bound = largest(best) * slack
                 word &= bits(near <= splat(bound))
     return best, found

@@ -10,7 +10,7 @@ import torch
 FLATNESS = 1e-5
 # Distances closer than this count as equal and go to the lowest triangle index.
 TIE_RELATIVE, TIE_METRES = 1e-6, 1e-9
-_PAIRS = 1 << 21  # point-triangle pairs at a time
+_PAIRS = 1 << 16  # point-triangle pairs at a time: what a cache holds
 
 
 class Topology:
