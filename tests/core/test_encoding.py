@@ -143,8 +143,9 @@ def test_bad_values_in_the_table_stay_where_they_are():
     assert got[1].isfinite().all()
 
 
-@pytest.mark.parametrize("layout", [SMALL, FULL], ids=["small", "full"])
-@pytest.mark.parametrize("count", [0, 1, 513, 5000])
+@pytest.mark.parametrize(
+    ("layout", "count"), [(SMALL, 0), (SMALL, 1), (SMALL, 513), (SMALL, 5000), (FULL, 3000)]
+)
 def test_table_gradients_agree_with_double_precision(layout, count):
     points = random_points(count)
     # Exactly representable grid positions on every level keep the comparison free of cell rounding.
@@ -169,6 +170,43 @@ def test_gradients_are_added_not_written(kernels):
     kernels.encode_backward_into(points, out, twice, SMALL)
     torch.testing.assert_close(twice, once + 1)
     assert once.abs().sum() > 0
+
+
+@BOTH
+def test_a_gradient_can_be_given_a_place(kernels):
+    """With grad_into nothing is returned and the same numbers are added there."""
+    latent, appearance, uv = texture_input(50)
+    features, which, triangles, triangle, barycentric = vertices_input(50)
+    cases = [
+        (random_tables(SMALL), lambda t, **k: kernels.encode(random_points(50), t, SMALL, **k)),
+        (latent, lambda t, **k: kernels.read_texture(t, appearance, uv, **k)),
+        (features, lambda t, **k: kernels.read_vertices(
+            t, which, triangles, triangle, barycentric, **k)),
+    ]  # fmt: skip
+    for source, read in cases:
+        leaf = source.clone().requires_grad_()
+        (want,) = torch.autograd.grad(read(leaf).square().sum(), leaf)
+        place = torch.ones_like(source)
+        out = read(leaf, grad_into=place)
+        out.square().sum().backward()
+        assert leaf.grad is None
+        torch.testing.assert_close(place, want + 1)
+
+
+@pytest.mark.parametrize(("layout", "count"), [(SMALL, 0), (SMALL, 700), (FULL, 700)])
+def test_adam_on_tables_is_backward_and_then_adam(layout, count):
+    points, tables = random_points(count), random_tables(layout)
+    ours = [tables.clone(), torch.zeros_like(tables), torch.zeros_like(tables)]
+    theirs = [tables.clone(), torch.zeros_like(tables), torch.zeros_like(tables)]
+    settings = {"lr": 1e-2, "eps": 1e-8, "weight_decay": 1e-3}
+    generator = torch.Generator().manual_seed(4)
+    for step in (1, 2, 3):
+        grad_out = torch.randn(count, layout.width, generator=generator)
+        cpu.encode_adam_step(points, grad_out, *ours, layout, step=step, **settings)
+        reference.encode_adam_step(points, grad_out, *theirs, layout, step=step, **settings)
+    for one, two in zip(ours, theirs, strict=True):
+        torch.testing.assert_close(one, two, rtol=1e-4, atol=1e-5)
+    assert not torch.equal(ours[0], tables)
 
 
 def test_reference_gradients():
@@ -260,6 +298,19 @@ def test_texture_agrees_with_double_precision(size, channels, count):
     (wanted,) = torch.autograd.grad(want, double, weight.double())
     bound = 1e-6 * size * (1 + count / size**2)
     torch.testing.assert_close(grad.double(), wanted, rtol=1e-4, atol=bound)
+
+
+@pytest.mark.parametrize("count", [0, 1, 5000])
+def test_texels_read_are_those_with_a_gradient(count):
+    latent, appearance, uv = texture_input(count, 40)
+    rows = cpu.texels_read(tuple(latent.shape), appearance, uv)
+    assert torch.equal(rows, reference.texels_read(tuple(latent.shape), appearance, uv))
+    grad = torch.zeros_like(latent)
+    cpu.read_texture_backward_into(appearance, uv, torch.ones(count, 5), grad)
+    touched = grad.view(-1, 5).abs().sum(1).nonzero().squeeze(1)
+    assert set(touched.tolist()) <= set(rows.tolist())
+    # At the borders a texel may be read with a weight of nothing.
+    assert len(rows) - len(touched) <= 2 + 0.02 * len(rows)
 
 
 def test_hostile_uv_is_clamped():

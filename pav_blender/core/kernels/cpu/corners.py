@@ -12,72 +12,34 @@ from typing import Any
 
 from llvmlite import ir
 from numba import njit, types
-from numba.core import cgutils
 from numba.extending import intrinsic
 
 from ..reference.encoding import PRIMES
 from .tiles import LANES
+from .writer import FLOAT, INT, LONG, Writer
 
 BLOCK = 512  # samples whose corners are worked out together
 AHEAD = 32  # samples between fetching an entry and reading it; 8 is too late, 128 too early
 STRIDE = BLOCK + AHEAD  # from corner to corner; what is fetched past the end is never read
 
-_INT = ir.IntType(32)
-_LONG = ir.IntType(64)
-_FLOATS = ir.VectorType(ir.FloatType(), LANES)
-_INTS = ir.VectorType(_INT, LANES)
-_PAIR = ir.VectorType(ir.FloatType(), 2)
-_FUSE = ("contract",)
+_FLOATS = ir.VectorType(FLOAT, LANES)
+_INTS = ir.VectorType(INT, LANES)
+_PAIR = ir.VectorType(FLOAT, 2)
 
 
-class _Writer:
-    """Instructions on the memory of numba arrays given as arguments of an intrinsic."""
+def _entry(writer: Writer, index: Any, i: Any, corner: int) -> Any:
+    """Place in the table of the first feature at a corner of sample i."""
+    builder = writer.builder
+    at = builder.add(i, LONG(corner * STRIDE))
+    return builder.shl(builder.zext(writer.load(index, at, INT), LONG), LONG(1))
 
-    def __init__(self, context: Any, builder: Any, signature: Any, values: Any) -> None:
-        self.builder = builder
-        self.values = [
-            cgutils.create_struct_proxy(kind)(context, builder, value).data
-            if isinstance(kind, types.Array)
-            else value
-            for kind, value in zip(signature.args, values, strict=True)
-        ]
 
-    def address(self, pointer: Any, at: Any, kind: Any) -> Any:
-        return self.builder.bitcast(self.builder.gep(pointer, [at]), kind.as_pointer())
-
-    def load(self, pointer: Any, at: Any, kind: Any) -> Any:
-        return self.builder.load(self.address(pointer, at, kind), align=4)
-
-    def store(self, value: Any, pointer: Any, at: Any) -> None:
-        self.builder.store(value, self.address(pointer, at, value.type), align=4)
-
-    def splat(self, value: Any, kind: Any) -> Any:
-        undefined = ir.Constant(kind, ir.Undefined)
-        one = self.builder.insert_element(undefined, value, _INT(0))
-        zeros = ir.Constant(ir.VectorType(_INT, kind.count), None)
-        return self.builder.shuffle_vector(one, undefined, zeros)
-
-    def product(self, a: Any, b: Any) -> Any:
-        return self.builder.fmul(a, b, flags=_FUSE)
-
-    def total(self, a: Any, b: Any) -> Any:
-        return self.builder.fadd(a, b, flags=_FUSE)
-
-    def entry(self, index: Any, i: Any, corner: int) -> Any:
-        """Place in the table of the first feature at a corner of sample i."""
-        at = self.builder.add(i, _LONG(corner * STRIDE))
-        return self.builder.shl(self.builder.zext(self.load(index, at, _INT), _LONG), _LONG(1))
-
-    def fetch(self, table: Any, index: Any, i: Any) -> None:
-        """Ask for the entries of the sample AHEAD of i; a corner and its neighbour in x mostly
-        share a cache line. Into the second cache: the first has fewer lines to wait with."""
-        builder = self.builder
-        later = builder.add(i, _LONG(AHEAD))
-        for corner in (0, 2, 4, 6):
-            pointer = self.address(table, self.entry(index, later, corner), ir.IntType(8))
-            kind = ir.FunctionType(ir.VoidType(), [pointer.type, _INT, _INT, _INT])
-            prefetch = builder.module.declare_intrinsic("llvm.prefetch", [pointer.type], kind)
-            builder.call(prefetch, [pointer, _INT(0), _INT(2), _INT(1)])
+def _fetch(writer: Writer, table: Any, index: Any, i: Any) -> None:
+    """Ask for the entries of the sample AHEAD of i, from every corner with the lower x: its
+    neighbour in x mostly shares the cache line."""
+    later = writer.builder.add(i, LONG(AHEAD))
+    for corner in (0, 2, 4, 6):
+        writer.fetch(table, _entry(writer, index, later, corner))
 
 
 def _locator(hashed: bool) -> Any:
@@ -86,15 +48,15 @@ def _locator(hashed: bool) -> Any:
         """Entries (counted from the whole table's start) and weights of samples i, i + 1, ..."""
 
         def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-            writer = _Writer(context, builder, signature, values)
+            writer = Writer(context, builder, signature, values)
             points, at, cells, start, bits, indices, weights = writer.values
-            cells, start, bits = (builder.trunc(v, _INT) for v in (cells, start, bits))
-            scale = writer.splat(builder.sitofp(cells, ir.FloatType()), _FLOATS)
-            last = writer.splat(builder.sub(cells, _INT(1)), _INTS)
+            cells, start, bits = (builder.trunc(v, INT) for v in (cells, start, bits))
+            scale = writer.splat(builder.sitofp(cells, FLOAT), _FLOATS)
+            last = writer.splat(builder.sub(cells, INT(1)), _INTS)
             one = ir.Constant(_FLOATS, [1.0] * LANES)
             cell, near, far = [], [], []
             for axis in range(3):
-                here = builder.add(at, _LONG(axis * BLOCK))
+                here = builder.add(at, LONG(axis * BLOCK))
                 position = builder.fmul(writer.load(points, here, _FLOATS), scale)
                 whole = builder.fptosi(position, _INTS)
                 whole = builder.select(builder.icmp_signed("<", whole, last), whole, last)
@@ -106,7 +68,7 @@ def _locator(hashed: bool) -> Any:
             begin = writer.splat(start, _INTS)
             for corner in range(8):
                 x, y, z = ((far if corner >> axis & 1 else near)[axis] for axis in range(3))
-                here = builder.add(at, _LONG(corner * STRIDE))
+                here = builder.add(at, LONG(corner * STRIDE))
                 writer.store(writer.product(writer.product(y, z), x), weights, here)
                 writer.store(builder.add(entries[corner], begin), indices, here)
             return context.get_dummy_value()
@@ -116,22 +78,22 @@ def _locator(hashed: bool) -> Any:
     return locate
 
 
-def _dense(writer: _Writer, cell: list[Any], cells: Any, bits: Any) -> list[Any]:
+def _dense(writer: Writer, cell: list[Any], cells: Any, bits: Any) -> list[Any]:
     builder = writer.builder
-    row = builder.add(cells, _INT(1))
+    row = builder.add(cells, INT(1))
     layer = builder.mul(row, row)
     entry = builder.add(cell[0], builder.mul(cell[1], writer.splat(row, _INTS)))
     entry = builder.add(entry, builder.mul(cell[2], writer.splat(layer, _INTS)))
     entries = []
     for corner in range(8):
-        step = _INT(corner & 1)
+        step = INT(corner & 1)
         step = builder.add(step, row) if corner & 2 else step
         step = builder.add(step, layer) if corner & 4 else step
         entries.append(builder.add(entry, writer.splat(step, _INTS)))
     return entries
 
 
-def _hashed(writer: _Writer, cell: list[Any], cells: Any, bits: Any) -> list[Any]:
+def _hashed(writer: Writer, cell: list[Any], cells: Any, bits: Any) -> list[Any]:
     builder = writer.builder
     primes = [ir.Constant(_INTS, [prime] * LANES) for prime in PRIMES]
     near = [builder.mul(part, prime) for part, prime in zip(cell, primes, strict=True)]
@@ -153,19 +115,19 @@ def read_corners(typing, table, index, weight, i, out, first, second):
     """Write the two features of sample i to out, at `first` and at `second`."""
 
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        writer = _Writer(context, builder, signature, values)
+        writer = Writer(context, builder, signature, values)
         entries, indices, weights, at, target, *places = writer.values
         sums = [ir.Constant(_PAIR, None)] * 2
         for corner in range(8):
-            here = builder.add(at, _LONG(corner * STRIDE))
-            share = writer.splat(writer.load(weights, here, ir.FloatType()), _PAIR)
-            pair = writer.load(entries, writer.entry(indices, at, corner), _PAIR)
+            here = builder.add(at, LONG(corner * STRIDE))
+            share = writer.splat(writer.load(weights, here, FLOAT), _PAIR)
+            pair = writer.load(entries, _entry(writer, indices, at, corner), _PAIR)
             half = corner & 1
             sums[half] = writer.total(sums[half], writer.product(share, pair))
-        writer.fetch(entries, indices, at)
+        _fetch(writer, entries, indices, at)
         both = builder.fadd(*sums)
         for feature, place in enumerate(places):
-            writer.store(builder.extract_element(both, _INT(feature)), target, place)
+            writer.store(builder.extract_element(both, INT(feature)), target, place)
         return context.get_dummy_value()
 
     return types.void(table, index, weight, i, out, first, second), generate
@@ -176,17 +138,17 @@ def add_corners(typing, table, index, weight, i, source, first, second):
     """Add the gradient of sample i's two features, at `first` and `second`, to its entries."""
 
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        writer = _Writer(context, builder, signature, values)
+        writer = Writer(context, builder, signature, values)
         entries, indices, weights, at, grads, *places = writer.values
         slope = ir.Constant(_PAIR, ir.Undefined)
         for feature, place in enumerate(places):
-            value = writer.load(grads, place, ir.FloatType())
-            slope = builder.insert_element(slope, value, _INT(feature))
-        writer.fetch(entries, indices, at)
+            value = writer.load(grads, place, FLOAT)
+            slope = builder.insert_element(slope, value, INT(feature))
+        _fetch(writer, entries, indices, at)
         for corner in range(8):
-            here = builder.add(at, _LONG(corner * STRIDE))
-            share = writer.splat(writer.load(weights, here, ir.FloatType()), _PAIR)
-            place = writer.entry(indices, at, corner)
+            here = builder.add(at, LONG(corner * STRIDE))
+            share = writer.splat(writer.load(weights, here, FLOAT), _PAIR)
+            place = _entry(writer, indices, at, corner)
             pair = writer.load(entries, place, _PAIR)
             writer.store(writer.total(pair, writer.product(share, slope)), entries, place)
         return context.get_dummy_value()
@@ -197,8 +159,8 @@ def add_corners(typing, table, index, weight, i, source, first, second):
 @intrinsic
 def _fetch_corners(typing, table, index, i):
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        writer = _Writer(context, builder, signature, values)
-        writer.fetch(*writer.values)
+        writer = Writer(context, builder, signature, values)
+        _fetch(writer, *writer.values)
         return context.get_dummy_value()
 
     return types.void(table, index, i), generate

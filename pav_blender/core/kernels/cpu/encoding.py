@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -19,12 +20,15 @@ from ..reference.encoding import (
     resolutions,
     table_sizes,
 )
-from .corners import BLOCK, STRIDE, add_corners, locate_block, read_corners
+from ..reference.optimiser import check_adam
+from . import corners, rows
+from .optimiser import adam_range, adam_settings
 from .threads import run_chunks, threads
 
 __all__ = [
     "Layout",
     "encode",
+    "encode_adam_step",
     "encode_backward_into",
     "read_texture",
     "read_texture_backward_into",
@@ -32,22 +36,25 @@ __all__ = [
     "read_vertices_backward_into",
     "resolutions",
     "table_sizes",
+    "texels_read",
 ]
 
+CHUNK = 4096  # samples of a latent read handed to a thread at a time
 # Not "nnan" or "ninf": points may be anything.
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 
 
-def encode(points: Tensor, tables: Tensor, layout: Layout) -> Tensor:
+def encode(
+    points: Tensor, tables: Tensor, layout: Layout, grad_into: Tensor | None = None
+) -> Tensor:
     """As the reference, in float32; the gradient goes to the tables only.
 
     The result [N, levels * 2] lies in memory feature by feature (its strides are 1 and N): levels
     are worked on one at a time, so that a level's table stays in the cache. `mlp` takes it so.
     """
     check_encode(points, tables, layout)
-    if points.requires_grad:
-        raise InputError("encode: the CPU kernel has no gradient for points; use the reference")
-    return _Encode.apply(points, tables, layout)
+    _refuse_gradient("encode", "points", points)
+    return _Encode.apply(points, tables, layout, grad_into)
 
 
 def encode_backward_into(
@@ -55,57 +62,71 @@ def encode_backward_into(
 ) -> None:
     """Add the gradient of `encode` with respect to the tables to grad_tables, in place."""
     check_encode(points, grad_tables, layout)
-    # A level belongs to one thread, so that no two add to one entry and sums have one order.
-    run_chunks(
-        _backward_levels,
-        layout.levels,
-        _levels_at_once(len(points), layout),
-        _array(points),
-        _array(grad_out.t()).reshape(-1),
-        _array(grad_tables, in_place=True).reshape(-1),
-        _level_array(layout),
-    )
+    arrays = _array(points), _array(grad_out.t()).reshape(-1), _flat_in_place(grad_tables)
+    _run_levels(_backward_levels, len(points), layout, *arrays, _level_array(layout))
+
+
+def encode_adam_step(
+    points: Tensor,
+    grad_out: Tensor,
+    tables: Tensor,
+    m: Tensor,
+    v: Tensor,
+    layout: Layout,
+    *,
+    step: int,
+    lr: float,
+    beta1: float = 0.9,
+    beta2: float = 0.99,
+    eps: float = 1e-15,
+    weight_decay: float = 0.0,
+) -> None:
+    """As the reference; a level's gradient is used while it lies in the cache, and forgotten."""
+    check_encode(points, tables, layout)
+    check_adam(tables, tables, m, v, step)
+    state = [_flat_in_place(tensor) for tensor in (tables, m, v)]
+    settings = adam_settings(step, lr, beta1, beta2, eps, weight_decay)
+    sizes = np.array(layout.sizes[::-1], np.int64)
+    arrays = _array(points), _array(grad_out.t()).reshape(-1), *state, settings, sizes
+    _run_levels(_adam_levels, len(points), layout, *arrays, _level_array(layout))
 
 
 class _Encode(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, points: Tensor, tables: Tensor, layout: Layout) -> Tensor:
-        out = torch.empty(layout.width, len(points))
-        run_chunks(
-            _encode_levels,
-            layout.levels,
-            _levels_at_once(len(points), layout),
-            _array(points),
-            _array(tables).reshape(-1),
-            out.view(-1).numpy(),
-            _level_array(layout),
-        )
+    def forward(
+        ctx: Any, points: Tensor, tables: Tensor, layout: Layout, into: Tensor | None
+    ) -> Tensor:
         ctx.save_for_backward(points)
-        ctx.layout = layout
+        ctx.layout, ctx.into = layout, into
+        out = torch.empty(layout.width, len(points))
+        arrays = _array(points), _array(tables).reshape(-1), out.view(-1).numpy()
+        _run_levels(_encode_levels, len(points), layout, *arrays, _level_array(layout))
         return out.t()
 
     @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[None, Tensor, None]:
+    def backward(ctx: Any, *grads: Tensor) -> tuple[None, Tensor | None, None, None]:
         (points,) = ctx.saved_tensors
-        grad_tables = torch.zeros(ctx.layout.entries, FEATURES)
-        encode_backward_into(points, grads[0], grad_tables, ctx.layout)
-        return None, grad_tables, None
+        shape = (ctx.layout.entries, FEATURES)
+        target, answer = _target(ctx.into, shape)
+        encode_backward_into(points, grads[0], target, ctx.layout)
+        return None, answer, None, None
+
+
+def _run_levels(kernel: Callable[..., Any], count: int, layout: Layout, *arrays: Any) -> None:
+    """A level belongs to one thread: no two add to one entry, and its sums have one order."""
+    share = -(-layout.levels // (2 * threads()))
+    # Few samples are not worth handing out a level at a time.
+    run_chunks(kernel, layout.levels, max(1, min(share, 8192 // max(count, 1))), *arrays)
 
 
 def _level_array(layout: Layout) -> np.ndarray:
-    """Resolution, first entry and hash mask (0 where dense) of every level, the finest first:
+    """Resolution, first entry, hash mask (0 where dense) and number of every level.
 
-    the levels that take longest begin first, and the short ones fill the gap at the end.
+    The finest come first: they take longest, and the short ones fill the gap at the end.
     """
     masks = [size - 1 if h else 0 for size, h in zip(layout.sizes, layout.hashed, strict=True)]
-    rows = [*zip(layout.resolutions, layout.offsets, masks, range(layout.levels), strict=True)]
-    return np.array(rows[::-1], np.int64)
-
-
-def _levels_at_once(count: int, layout: Layout) -> int:
-    """Few samples are not worth handing out a level at a time."""
-    share = -(-layout.levels // (2 * threads()))
-    return max(1, min(share, 8192 // max(count, 1)))
+    found = [*zip(layout.resolutions, layout.offsets, masks, range(layout.levels), strict=True)]
+    return np.array(found[::-1], np.int64)
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
@@ -115,49 +136,75 @@ def _transpose_points(points, start, count, unit):
         for axis in range(3):
             p = points[start + i, axis]
             p = p if p > 0 else np.float32(0)
-            unit[axis * BLOCK + i] = p if p < 1 else np.float32(1)
+            unit[axis * corners.BLOCK + i] = p if p < 1 else np.float32(1)
+
+
+@njit(cache=True, nogil=True)
+def _scratch():
+    """Room for a block: points, entries, weights."""
+    size = 8 * corners.STRIDE
+    return (
+        np.zeros(3 * corners.BLOCK, np.float32),
+        np.zeros(size, np.int32),
+        np.zeros(size, np.float32),
+    )
 
 
 @njit(cache=True, nogil=True)
 def _encode_levels(first, end, points, table, out, levels):
-    unit = np.zeros(3 * BLOCK, np.float32)
-    index = np.zeros(8 * STRIDE, np.int32)
-    weight = np.zeros(8 * STRIDE, np.float32)
+    unit, index, weight = _scratch()
     total = len(points)
     for k in range(first, end):
         res, entry, mask, level = levels[k]
-        for begin in range(0, total, BLOCK):
-            count = min(BLOCK, total - begin)
+        for begin in range(0, total, corners.BLOCK):
+            count = min(corners.BLOCK, total - begin)
             _transpose_points(points, begin, count, unit)
-            locate_block(unit, count, res, entry, mask, table, index, weight)
+            corners.locate_block(unit, count, res, entry, mask, table, index, weight)
             at = 2 * level * total + begin
             for i in range(count):
-                read_corners(table, index, weight, i, out, at + i, at + total + i)
+                corners.read_corners(table, index, weight, i, out, at + i, at + total + i)
+
+
+@njit(cache=True, nogil=True)
+def _backward_level(points, grad_out, level, res, entry, mask, grad_table, scratch):
+    """Add the gradient of one level, whose first entry is `entry`, to grad_table."""
+    unit, index, weight = scratch
+    total = len(points)
+    for begin in range(0, total, corners.BLOCK):
+        count = min(corners.BLOCK, total - begin)
+        _transpose_points(points, begin, count, unit)
+        corners.locate_block(unit, count, res, entry, mask, grad_table, index, weight)
+        at = 2 * level * total + begin
+        for i in range(count):
+            corners.add_corners(grad_table, index, weight, i, grad_out, at + i, at + total + i)
 
 
 @njit(cache=True, nogil=True)
 def _backward_levels(first, end, points, grad_out, grad_table, levels):
-    unit = np.zeros(3 * BLOCK, np.float32)
-    index = np.zeros(8 * STRIDE, np.int32)
-    weight = np.zeros(8 * STRIDE, np.float32)
-    total = len(points)
+    scratch = _scratch()
     for k in range(first, end):
         res, entry, mask, level = levels[k]
-        for begin in range(0, total, BLOCK):
-            count = min(BLOCK, total - begin)
-            _transpose_points(points, begin, count, unit)
-            locate_block(unit, count, res, entry, mask, grad_table, index, weight)
-            at = 2 * level * total + begin
-            for i in range(count):
-                add_corners(grad_table, index, weight, i, grad_out, at + i, at + total + i)
+        _backward_level(points, grad_out, level, res, entry, mask, grad_table, scratch)
 
 
-def read_texture(latent: Tensor, appearance: Tensor, uv: Tensor) -> Tensor:
+@njit(cache=True, nogil=True)
+def _adam_levels(first, end, points, grad_out, table, m, v, settings, sizes, levels):
+    scratch = _scratch()
+    for k in range(first, end):
+        res, entry, mask, level = levels[k]
+        grad = np.zeros(2 * sizes[k], np.float32)
+        _backward_level(points, grad_out, level, res, np.int64(0), mask, grad, scratch)
+        low, high = 2 * entry, 2 * (entry + sizes[k])
+        adam_range(0, high - low, table[low:high], grad, m[low:high], v[low:high], settings, False)
+
+
+def read_texture(
+    latent: Tensor, appearance: Tensor, uv: Tensor, grad_into: Tensor | None = None
+) -> Tensor:
     """As the reference, in float32; the gradient goes to the textures only."""
     check_texture(latent, appearance, uv)
-    if uv.requires_grad:
-        raise InputError("read_texture: the CPU kernel has no gradient for uv; use the reference")
-    return _ReadTexture.apply(latent, appearance, uv)
+    _refuse_gradient("read_texture", "uv", uv)
+    return _ReadTexture.apply(latent, appearance, uv, grad_into)
 
 
 def read_texture_backward_into(
@@ -165,94 +212,89 @@ def read_texture_backward_into(
 ) -> None:
     """Add the gradient of `read_texture` with respect to the textures to grad_latent, in place."""
     check_texture(grad_latent, appearance, uv)
-    # Channels are split, not samples: no two threads add to one number.
-    channels = grad_latent.shape[3]
-    run_chunks(
-        _texture_backward,
-        channels,
-        max(1, -(-channels // threads())),
-        _array(appearance, torch.int32),
-        _array(uv),
-        _array(grad_out),
-        _array(grad_latent, in_place=True),
-    )
+    places = _array(appearance, torch.int32), _array(uv)
+    size, width = grad_latent.shape[2:]
+    flat = _flat_in_place(grad_latent)
+    _run_parts(_add_texels, size, width, *places, _array(grad_out).reshape(-1), flat)
+
+
+def texels_read(shape: tuple[int, ...], appearance: Tensor, uv: Tensor) -> Tensor:
+    """As the reference: rows of a latent texture [A,S,S,C], as [A*S*S,C], that a read touches."""
+    seen = np.zeros(shape[0] * shape[1] * shape[2], np.bool_)
+    places = _array(appearance, torch.int32), _array(uv)
+    # Threads may mark one texel at once, with the same mark.
+    run_chunks(_mark_texels, len(uv), CHUNK, shape[1], *places, seen)
+    return torch.from_numpy(np.flatnonzero(seen))
 
 
 class _ReadTexture(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, latent: Tensor, appearance: Tensor, uv: Tensor) -> Tensor:
-        out = torch.empty(len(uv), latent.shape[3])
-        arrays = (_array(latent), _array(appearance, torch.int32), _array(uv), out.numpy())
-        run_chunks(_texture_samples, len(uv), BLOCK * 8, *arrays)
+    def forward(
+        ctx: Any, latent: Tensor, appearance: Tensor, uv: Tensor, into: Tensor | None
+    ) -> Tensor:
         ctx.save_for_backward(appearance, uv)
-        ctx.shape = latent.shape
+        ctx.shape, ctx.into = latent.shape, into
+        size, width = latent.shape[2:]
+        out = torch.empty(len(uv), width)
+        arrays = _array(latent).reshape(-1), _array(appearance, torch.int32), _array(uv)
+        run_chunks(_read_texels, len(uv), CHUNK, size, width, *arrays, out.view(-1).numpy())
         return out
 
     @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None]:
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, None, None, None]:
+        target, answer = _target(ctx.into, ctx.shape)
         appearance, uv = ctx.saved_tensors
-        grad_latent = torch.zeros(ctx.shape)
-        read_texture_backward_into(appearance, uv, grads[0], grad_latent)
-        return grad_latent, None, None
+        read_texture_backward_into(appearance, uv, grads[0], target)
+        return answer, None, None, None
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
-def _texel(coordinate, size):
-    """Texel below a coordinate in [0, 1] and how far the coordinate lies toward the next."""
-    c = coordinate if coordinate > 0 else np.float32(0)
-    c = c if c < 1 else np.float32(1)
-    position = c * np.float32(size) - np.float32(0.5)
-    position = min(max(position, np.float32(0)), np.float32(size - 1))
-    low = min(np.int64(position), max(size - 2, 0))
-    return low, position - np.float32(low)
+@njit(cache=True, nogil=True)
+def _read_texels(start, stop, size, width, latent, appearance, uv, out):
+    index = np.zeros(4 * rows.STRIDE, np.int64)
+    weight = np.zeros(4 * rows.STRIDE, np.float32)
+    for begin in range(start, stop, rows.BLOCK):
+        count = min(rows.BLOCK, stop - begin)
+        rows.locate_texels(size, appearance, uv, begin, count, index, weight)
+        rows.read_rows(latent, width, index, weight, np.int64(4), count, out, begin)
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
-def _texture_samples(start, stop, latent, appearance, uv, out):
-    size = latent.shape[1]
-    for i in range(start, stop):
-        u, fu = _texel(uv[i, 0], size)
-        v, fv = _texel(uv[i, 1], size)
-        u1 = min(u + 1, size - 1)
-        v1 = min(v + 1, size - 1)
-        gu = np.float32(1) - fu
-        gv = np.float32(1) - fv
-        texture = latent[appearance[i]]
-        for c in range(latent.shape[3]):
-            first = gu * texture[v, u, c] + fu * texture[v, u1, c]
-            second = gu * texture[v1, u, c] + fu * texture[v1, u1, c]
-            out[i, c] = gv * first + fv * second
+@njit(cache=True, nogil=True)
+def _add_texels(first, end, parts, size, width, appearance, uv, grad_out, grad_latent):
+    index = np.zeros(4 * rows.STRIDE, np.int64)
+    weight = np.zeros(4 * rows.STRIDE, np.float32)
+    for part in range(first, end):
+        for begin in range(0, len(uv), rows.BLOCK):
+            count = min(rows.BLOCK, len(uv) - begin)
+            rows.locate_texels(size, appearance, uv, begin, count, index, weight)
+            rows.add_rows(
+                grad_latent, width, index, weight, np.int64(4), count, grad_out, begin, part, parts
+            )
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
-def _texture_backward(first, end, appearance, uv, grad_out, grad_latent):
-    size = grad_latent.shape[1]
-    for i in range(len(uv)):
-        u, fu = _texel(uv[i, 0], size)
-        v, fv = _texel(uv[i, 1], size)
-        u1 = min(u + 1, size - 1)
-        v1 = min(v + 1, size - 1)
-        gu = np.float32(1) - fu
-        gv = np.float32(1) - fv
-        texture = grad_latent[appearance[i]]
-        for c in range(first, end):
-            g = grad_out[i, c]
-            texture[v, u, c] += g * gu * gv
-            texture[v, u1, c] += g * fu * gv
-            texture[v1, u, c] += g * gu * fv
-            texture[v1, u1, c] += g * fu * fv
+@njit(cache=True, nogil=True)
+def _mark_texels(start, stop, size, appearance, uv, seen):
+    index = np.zeros(4 * rows.STRIDE, np.int64)
+    weight = np.zeros(4 * rows.STRIDE, np.float32)
+    for begin in range(start, stop, rows.BLOCK):
+        count = min(rows.BLOCK, stop - begin)
+        rows.locate_texels(size, appearance, uv, begin, count, index, weight)
+        for corner in range(4):
+            for i in range(count):
+                seen[index[corner * rows.STRIDE + i]] = True
 
 
 def read_vertices(
-    latent: Tensor, appearance: Tensor, triangles: Tensor, triangle: Tensor, barycentric: Tensor
+    latent: Tensor,
+    appearance: Tensor,
+    triangles: Tensor,
+    triangle: Tensor,
+    barycentric: Tensor,
+    grad_into: Tensor | None = None,
 ) -> Tensor:
     """As the reference, in float32; the gradient goes to the features only."""
     check_vertices(latent, appearance, triangles, triangle, barycentric)
-    if barycentric.requires_grad:
-        raise InputError(
-            "read_vertices: the CPU kernel has no gradient for barycentrics; use the reference"
-        )
-    return _ReadVertices.apply(latent, appearance, triangles, triangle, barycentric)
+    _refuse_gradient("read_vertices", "barycentrics", barycentric)
+    return _ReadVertices.apply(latent, appearance, triangles, triangle, barycentric, grad_into)
 
 
 def read_vertices_backward_into(
@@ -265,18 +307,10 @@ def read_vertices_backward_into(
 ) -> None:
     """Add the gradient of `read_vertices` with respect to the features to grad_latent, in place."""
     check_vertices(grad_latent, appearance, triangles, triangle, barycentric)
-    channels = grad_latent.shape[2]
-    run_chunks(
-        _vertices_backward,
-        channels,
-        max(1, -(-channels // threads())),
-        _array(appearance, torch.int32),
-        _array(triangles, torch.int32),
-        _array(triangle, torch.int32),
-        _array(barycentric),
-        _array(grad_out),
-        _array(grad_latent, in_place=True),
-    )
+    places = _mesh_arrays(appearance, triangles, triangle, barycentric)
+    vertices, width = grad_latent.shape[1:]
+    flat = _flat_in_place(grad_latent)
+    _run_parts(_add_vertices, vertices, width, *places, _array(grad_out).reshape(-1), flat)
 
 
 class _ReadVertices(torch.autograd.Function):
@@ -288,66 +322,96 @@ class _ReadVertices(torch.autograd.Function):
         triangles: Tensor,
         triangle: Tensor,
         barycentric: Tensor,
+        into: Tensor | None,
     ) -> Tensor:
-        out = torch.empty(len(barycentric), latent.shape[2])
-        run_chunks(
-            _vertices_samples,
-            len(barycentric),
-            BLOCK * 8,
-            _array(latent),
-            _array(appearance, torch.int32),
-            _array(triangles, torch.int32),
-            _array(triangle, torch.int32),
-            _array(barycentric),
-            out.numpy(),
-        )
         ctx.save_for_backward(appearance, triangles, triangle, barycentric)
-        ctx.shape = latent.shape
+        ctx.shape, ctx.into = latent.shape, into
+        vertices, width = latent.shape[1:]
+        out = torch.empty(len(barycentric), width)
+        arrays = (
+            _array(latent).reshape(-1),
+            *_mesh_arrays(appearance, triangles, triangle, barycentric),
+            out.view(-1).numpy(),
+        )
+        run_chunks(_read_vertices, len(barycentric), CHUNK, vertices, width, *arrays)
         return out
 
     @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None, None, None]:
-        grad_latent = torch.zeros(ctx.shape)
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, None, None, None, None, None]:
         appearance, triangles, triangle, barycentric = ctx.saved_tensors
-        read_vertices_backward_into(
-            appearance, triangles, triangle, barycentric, grads[0], grad_latent
+        target, answer = _target(ctx.into, ctx.shape)
+        read_vertices_backward_into(appearance, triangles, triangle, barycentric, grads[0], target)
+        return answer, None, None, None, None, None
+
+
+def _mesh_arrays(
+    appearance: Tensor, triangles: Tensor, triangle: Tensor, barycentric: Tensor
+) -> tuple[Any, ...]:
+    integers = (_array(tensor, torch.int32) for tensor in (appearance, triangles, triangle))
+    return (*integers, _array(barycentric))
+
+
+@njit(cache=True, nogil=True)
+def _read_vertices(
+    start, stop, vertices, width, latent, appearance, triangles, triangle, barycentric, out
+):
+    index = np.zeros(3 * rows.STRIDE, np.int64)
+    weight = np.zeros(3 * rows.STRIDE, np.float32)
+    for begin in range(start, stop, rows.BLOCK):
+        count = min(rows.BLOCK, stop - begin)
+        rows.locate_vertices(
+            vertices, appearance, triangles, triangle, barycentric, begin, count, index, weight
         )
-        return grad_latent, None, None, None, None
+        rows.read_rows(latent, width, index, weight, np.int64(3), count, out, begin)
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
-def _vertices_samples(start, stop, latent, appearance, triangles, triangle, barycentric, out):
-    for i in range(start, stop):
-        features = latent[appearance[i]]
-        a, b, c = triangles[triangle[i]]
-        wa, wb, wc = barycentric[i]
-        for channel in range(latent.shape[2]):
-            out[i, channel] = (
-                wa * features[a, channel] + wb * features[b, channel] + wc * features[c, channel]
+@njit(cache=True, nogil=True)
+def _add_vertices(first, end, parts, vertices, width, appearance, triangles, triangle, barycentric,
+                  grad_out, grad_latent):  # fmt: skip
+    index = np.zeros(3 * rows.STRIDE, np.int64)
+    weight = np.zeros(3 * rows.STRIDE, np.float32)
+    for part in range(first, end):
+        for begin in range(0, len(triangle), rows.BLOCK):
+            count = min(rows.BLOCK, len(triangle) - begin)
+            rows.locate_vertices(
+                vertices, appearance, triangles, triangle, barycentric, begin, count, index, weight
+            )
+            rows.add_rows(
+                grad_latent, width, index, weight, np.int64(3), count, grad_out, begin, part, parts
             )
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
-def _vertices_backward(
-    first, end, appearance, triangles, triangle, barycentric, grad_out, grad_latent
-):
-    for i in range(len(triangle)):
-        features = grad_latent[appearance[i]]
-        a, b, c = triangles[triangle[i]]
-        wa, wb, wc = barycentric[i]
-        for channel in range(first, end):
-            g = grad_out[i, channel]
-            features[a, channel] += wa * g
-            features[b, channel] += wb * g
-            features[c, channel] += wc * g
+def _run_parts(kernel: Callable[..., Any], *arrays: Any) -> None:
+    """Rows of a table are shared out between threads, in a power of two of parts."""
+    parts = 1 << (threads().bit_length() - 1)
+    run_chunks(kernel, parts, 1, parts, *arrays)
 
 
-def _array(tensor: Tensor, dtype: torch.dtype = torch.float32, in_place: bool = False) -> Any:
+def _target(into: Tensor | None, shape: Any) -> tuple[Tensor, Tensor | None]:
+    """What to add a gradient to, and what to tell autograd: nothing where it has a place."""
+    if into is not None:
+        return into, None
+    fresh = torch.zeros(shape)
+    return fresh, fresh
+
+
+def _refuse_gradient(function: str, name: str, tensor: Tensor) -> None:
+    if tensor.requires_grad and torch.is_grad_enabled():
+        raise InputError(
+            f"{function}: the CPU kernel has no gradient for {name}; use the reference"
+        )
+
+
+def _flat_in_place(tensor: Tensor) -> Any:
+    if not tensor.is_contiguous():
+        raise InputError("CPU kernels change contiguous tensors in place, and no others")
+    return _array(tensor).reshape(-1)
+
+
+def _array(tensor: Tensor, dtype: torch.dtype = torch.float32) -> Any:
     """The tensor's memory as an array; copied only where it is not contiguous or another type."""
     if tensor.device.type != "cpu" or (dtype == torch.float32 and tensor.dtype != dtype):
         raise InputError(
             f"CPU kernels work on float32 in main memory, not on {tensor.dtype} on {tensor.device}"
         )
-    if in_place and not tensor.is_contiguous():
-        raise InputError("CPU kernels add gradients in place to contiguous tensors only")
     return tensor.detach().to(dtype).contiguous().numpy()

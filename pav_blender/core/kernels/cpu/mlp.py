@@ -291,26 +291,31 @@ def _layers(begin, count, rows, layers, x, x_at, x_step, x_stride,
         row = plan[layer]
         out_at, out_step = row[HIDDEN], row[OUT_PAD]
         finish = RELU if layer < len(plan) - 1 else PLAIN
-        init, init_at, init_step = packed, row[BIAS], 0
+        init, init_at, init_step = packed, row[BIAS], np.int64(0)
         if layer == 0 and len(bias_rows) > 0:
             _group_rows(begin, count, row, packed, bias_rows, group, work)
             init, init_at, init_step = work, out_at, out_step
         multiply(rows, row[OUT], row[IN], finish, work, out_at, out_step,
                  init, init_at, init_step, a, at, step, stride,
                  packed, row[FORWARD], out_step, work, out_at, out_step)  # fmt: skip
-        a, at, step, stride = work, out_at, out_step, 1
+        a, at, step, stride = work, out_at, out_step, np.int64(1)
+
+
+# Below, constants that are passed on have a type of their own: numba would compile what they are
+# passed to once more for every value.
 
 
 @njit(cache=True, nogil=True)
 def _forward_samples(start, stop, x, turned, packed, plan, bias_rows, group, out):
     work = _scratch(plan)
+    zero, no = np.int64(0), np.bool_(False)
     flat = x.ravel()
     first, last = plan[0], plan[-1]
     for begin in range(start, stop, BLOCK):
         count = min(BLOCK, stop - begin)
         if count < BLOCK:
             # Tiles are read whole, so that samples past the end must exist.
-            _copy_in(x, turned, begin, count, work, 0, first[IN_PAD])
+            _copy_in(x, turned, begin, count, work, zero, first[IN_PAD])
             a, at, step, stride = work, 0, first[IN_PAD], 1
         elif turned:
             a, at, step, stride = flat, begin, 1, x.shape[1]
@@ -318,7 +323,7 @@ def _forward_samples(start, stop, x, turned, packed, plan, bias_rows, group, out
             a, at, step, stride = flat, begin * first[IN], first[IN], 1
         _layers(begin, count, count, len(plan), a, at, step, stride,
                 packed, plan, bias_rows, group, work)  # fmt: skip
-        _copy_out(work, last[HIDDEN], last[OUT_PAD], out, False, begin, count)
+        _copy_out(work, last[HIDDEN], last[OUT_PAD], out, no, begin, count)
 
 
 @njit(cache=True, nogil=True)
@@ -326,6 +331,8 @@ def _backward_parts(first, end, size, x, turned, packed, plan, bias_rows, group,
                     sums, spans, group_sums):  # fmt: skip
     work = _scratch(plan)
     slopes = np.zeros_like(work)
+    zero, one, block = np.int64(0), np.int64(1), np.int64(BLOCK)
+    plain, no = np.int64(PLAIN), np.bool_(False)
     zeros = np.zeros(plan[:, IN_PAD].max(), np.float32)
     start, last = plan[0], plan[-1]
     total = len(grad_out)
@@ -333,24 +340,24 @@ def _backward_parts(first, end, size, x, turned, packed, plan, bias_rows, group,
         stop = min((part + 1) * size, total)
         for begin in range(part * size, stop, BLOCK):
             count = min(BLOCK, stop - begin)
-            _copy_in(x, turned, begin, count, work, 0, start[IN_PAD])
-            _layers(begin, count, BLOCK, len(plan) - 1, work, 0, start[IN_PAD], 1,
+            _copy_in(x, turned, begin, count, work, zero, start[IN_PAD])
+            _layers(begin, count, block, len(plan) - 1, work, zero, start[IN_PAD], one,
                     packed, plan, bias_rows, group, work)  # fmt: skip
-            _copy_in(grad_out, False, begin, count, slopes, last[HIDDEN], last[OUT_PAD])
+            _copy_in(grad_out, no, begin, count, slopes, last[HIDDEN], last[OUT_PAD])
             for layer in range(len(plan) - 1, -1, -1):
                 row = plan[layer]
                 at, step = row[HIDDEN], row[OUT_PAD]
                 in_at = plan[layer - 1, HIDDEN] if layer > 0 else 0
                 in_step = row[IN_PAD]
                 grad_at = row[GRAD_WEIGHT]
-                multiply(row[OUT], row[IN], BLOCK, PLAIN, sums[part], grad_at, in_step,
-                         sums[part], grad_at, in_step, slopes, at, 1, step,
+                multiply(row[OUT], row[IN], block, plain, sums[part], grad_at, in_step,
+                         sums[part], grad_at, in_step, slopes, at, one, step,
                          work, in_at, in_step, work, in_at, in_step)  # fmt: skip
                 _add_rows(slopes, at, step, count, sums[part], row[GRAD_BIAS])
                 if layer > 0 or len(grad_x) > 0:
                     finish = MASKED if layer > 0 else PLAIN
-                    multiply(BLOCK, row[IN], row[OUT], finish, slopes, in_at, in_step,
-                             zeros, 0, 0, slopes, at, step, 1,
+                    multiply(block, row[IN], row[OUT], finish, slopes, in_at, in_step,
+                             zeros, zero, zero, slopes, at, step, one,
                              packed, row[BACKWARD], in_step, work, in_at, in_step)  # fmt: skip
             if len(bias_rows) > 0:
                 own = spans[part, 1] - spans[part, 0]
@@ -361,7 +368,7 @@ def _backward_parts(first, end, size, x, turned, packed, plan, bias_rows, group,
                     for k in range(len(target)):
                         target[k] += line[k]
             if len(grad_x) > 0:
-                _copy_out(slopes, 0, start[IN_PAD], grad_x, turned, begin, count)
+                _copy_out(slopes, zero, start[IN_PAD], grad_x, turned, begin, count)
 
 
 @njit(cache=True, nogil=True)

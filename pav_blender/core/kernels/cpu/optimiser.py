@@ -32,8 +32,8 @@ def adam_step(
     """As the reference, on contiguous float32."""
     check_adam(param, grad, m, v, step)
     arrays = [_flat(tensor) for tensor in (param, grad, m, v)]
-    settings = _settings(step, lr, beta1, beta2, eps, weight_decay)
-    run_chunks(_adam, param.numel(), CHUNK, *arrays, settings, zero_grad)
+    settings = adam_settings(step, lr, beta1, beta2, eps, weight_decay)
+    run_chunks(adam_range, param.numel(), CHUNK, *arrays, settings, zero_grad)
 
 
 def sparse_adam_step(
@@ -55,7 +55,7 @@ def sparse_adam_step(
     check_adam(param, grad, m, v, step)
     width = param.shape[-1]
     arrays = [_flat(tensor) for tensor in (param, grad, m, v)]
-    settings = _settings(step, lr, beta1, beta2, eps, weight_decay)
+    settings = adam_settings(step, lr, beta1, beta2, eps, weight_decay)
     if rows is None and param.ndim == 2:
         chunk = max(1, CHUNK // max(1, width))
         run_chunks(_adam_nonzero, len(param), chunk, width, *arrays, settings, zero_grad)
@@ -65,7 +65,7 @@ def sparse_adam_step(
     run_chunks(_adam_rows, len(index), chunk, index, width, *arrays, settings, zero_grad)
 
 
-def _settings(
+def adam_settings(
     step: int, lr: float, beta1: float, beta2: float, eps: float, weight_decay: float
 ) -> np.ndarray:
     """The step's numbers as the kernel wants them, worked out in double precision."""
@@ -84,7 +84,7 @@ def _flat(tensor: Tensor) -> Any:
 
 
 @njit(cache=True, nogil=True, fastmath={"contract", "nsz"}, error_model="numpy")
-def _adam(start, stop, param, grad, m, v, settings, zero_grad):
+def adam_range(start, stop, param, grad, m, v, settings, zero_grad):
     rate = np.float32(settings[0])
     spread = np.float32(settings[1])
     keep1, take1 = np.float32(settings[2]), np.float32(1 - settings[2])
@@ -106,7 +106,7 @@ def _adam(start, stop, param, grad, m, v, settings, zero_grad):
 def _adam_rows(start, stop, rows, width, param, grad, m, v, settings, zero_grad):
     for k in range(start, stop):
         first = rows[k] * width
-        _adam(first, first + width, param, grad, m, v, settings, zero_grad)
+        adam_range(first, first + width, param, grad, m, v, settings, zero_grad)
 
 
 @njit(cache=True, nogil=True)
@@ -117,4 +117,4 @@ def _adam_nonzero(start, stop, width, param, grad, m, v, settings, zero_grad):
         for i in range(first, first + width):
             touched |= grad[i] != 0
         if touched:
-            _adam(first, first + width, param, grad, m, v, settings, zero_grad)
+            adam_range(first, first + width, param, grad, m, v, settings, zero_grad)
