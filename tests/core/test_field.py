@@ -35,6 +35,7 @@ def make_samples(count=40, seed=0):
         canonical=torch.rand(count, 3, generator=g),
         triangle=torch.randint(0, 2, (count,), generator=g, dtype=torch.int32),
         barycentric=barycentric / barycentric.sum(1, keepdim=True),
+        distance=torch.rand(count, generator=g) * 0.02,
         appearance=torch.randint(0, 3, (count,), generator=g, dtype=torch.int32),
         frame=torch.randint(0, 2, (count,), generator=g, dtype=torch.int32),
         ray=torch.arange(count, dtype=torch.int32),
@@ -140,9 +141,9 @@ def test_a_blend_of_one_appearance_is_that_appearance():
     field, samples = make_field(), make_samples()
     alone = dataclasses.replace(samples, appearance=torch.full((40,), 2, dtype=torch.int32))
     mixed = dataclasses.replace(samples, appearance=torch.zeros(40, dtype=torch.int32))
-    latent = field.mixed_latent(torch.tensor([0.0, 0.0, 1.0]))
+    blend = field.blend(torch.tensor([0.0, 0.0, 1.0]))
     with torch.no_grad():
-        for a, b in zip(field(alone), field(mixed, latent), strict=True):
+        for a, b in zip(field(alone), field(mixed, blend), strict=True):
             torch.testing.assert_close(a, b)
 
 

@@ -6,12 +6,16 @@ Appearance Conditioned NeRF).
     F_color:   (Z^x, d, features) -> colour
 
 Densities are per millimetre and add before the exponential, so that their sum cannot be negative.
+They start from the tracked mesh, opaque on it and near nothing away from it (`start_on_mesh`): a
+field that starts as fog spends minutes finding out where the head is, and thins what is solid
+while it clears the rest, since opaque samples have no gradient that would resist.
 What is constant over a frame (e) or a ray (d) enters a network's first layer as a bias computed
 once a frame or ray: the same numbers, for far fewer operations.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -29,6 +33,7 @@ class Samples:
     """N points to evaluate, packed; see the module's conventions for indices.
 
     canonical [N, 3] in the field's unit box; triangle [N] int32; barycentric [N, 3];
+    distance [N], metres from the posed mesh;
     appearance [N] int32, frame [N] int32, ray [N] int32 (rows of what follows);
     expression [frames, E]; direction [rays, 3], unit, in the head's own axes.
     """
@@ -36,11 +41,20 @@ class Samples:
     canonical: torch.Tensor
     triangle: torch.Tensor
     barycentric: torch.Tensor
+    distance: torch.Tensor
     appearance: torch.Tensor
     frame: torch.Tensor
     ray: torch.Tensor
     expression: torch.Tensor
     direction: torch.Tensor
+
+
+@dataclass
+class Worn:
+    """What an appearance looks up: latent features [A, ...] and a code [A, C or 0]."""
+
+    latent: torch.Tensor
+    code: torch.Tensor
 
 
 class Mlp(nn.Module):
@@ -52,7 +66,7 @@ class Mlp(nn.Module):
         super().__init__()
         sizes = [inputs, *[hidden] * layers, outputs]
         self.weights = nn.ParameterList(
-            nn.Parameter(torch.empty(o, i)) for i, o in zip(sizes[:-1], sizes[1:], strict=True)
+            nn.Parameter(torch.empty(o, i)) for i, o in itertools.pairwise(sizes)
         )
         self.biases = nn.ParameterList(nn.Parameter(torch.zeros(o)) for o in sizes[1:])
         self.group_weight = nn.Parameter(torch.zeros(hidden, group_inputs))
@@ -109,6 +123,10 @@ class Field(nn.Module):
             "none": (appearances, 0),
         }[config.appearance]
         self.latent = nn.Parameter(torch.randn(shape) * 0.1)
+        # what an appearance's features have in common: every sample teaches it, so that
+        # appearances part company long before each vertex was seen often
+        codes = config.latent_channels if config.appearance_code else 0
+        self.code = nn.Parameter(torch.randn(appearances, codes) * 0.5)
         embedding, geometry = config.embedding_channels, config.geometry_channels
         self.density = Mlp(
             self.layout.width, expressions, config.hidden, config.density_layers, geometry
@@ -117,68 +135,84 @@ class Field(nn.Module):
         if config.density_offset and embedding:
             seen = geometry - 1 if config.offset_sees_geometry else 0
             self.offset = Mlp(embedding + seen, expressions, config.hidden, config.offset_layers, 1)
-            # starts as no offset: the shared density comes first
-            nn.init.zeros_(self.offset.weights[-1])
+            # starts as next to no offset: the shared density comes first
+            nn.init.normal_(self.offset.weights[-1], 0, 1e-2)
         self.colour = Mlp(
             geometry + embedding, directions.CHANNELS, config.hidden, config.colour_layers, 3
         )
 
-    def embedding(self, samples: Samples, latent: torch.Tensor) -> torch.Tensor:
+    def embedding(self, samples: Samples, worn: Worn) -> torch.Tensor:
         """Z^x [N, C]: the appearance's latent features at the nearest surface point."""
         ops = kernels.select(self.tables.device)
         if self.config.appearance == "vertex":
-            return ops.encoding.read_vertices(
-                latent,
+            features = ops.encoding.read_vertices(
+                worn.latent,
                 samples.appearance,
                 self.triangles,
                 samples.triangle,
                 samples.barycentric,
             )
-        if self.config.appearance == "surface":
+        elif self.config.appearance == "surface":
             corners = self.corner_uvs[samples.triangle.long()]
             uv = (corners * samples.barycentric[:, :, None]).sum(1)
-            return ops.encoding.read_texture(latent, samples.appearance, uv)
-        return latent[samples.appearance.long()]
+            features = ops.encoding.read_texture(worn.latent, samples.appearance, uv)
+        else:
+            return worn.latent[samples.appearance.long()]
+        if worn.code.shape[1] == 0:
+            return features
+        return features + worn.code[samples.appearance.long()]
 
     def _geometry(
-        self, samples: Samples, latent: torch.Tensor
+        self, samples: Samples, worn: Worn
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Log-density before its bias [N, 1], geometry features [N, C - 1], embedding Z^x."""
         ops = kernels.select(self.tables.device)
         encoded = ops.encoding.encode(samples.canonical, self.tables, self.layout)
         geometry = self.density(encoded, samples.expression, samples.frame)
         raw, features = geometry[:, :1], geometry[:, 1:]
-        embedding = self.embedding(samples, latent)
+        embedding = self.embedding(samples, worn)
         if self.offset is not None:
             sees = self.config.offset_sees_geometry
             seen = torch.cat([embedding, features], 1) if sees else embedding
             raw = raw + self.offset(seen, samples.expression, samples.frame)
         return raw, features, embedding
 
-    def _density(self, raw: torch.Tensor) -> torch.Tensor:
+    def _density(self, raw: torch.Tensor, distance: torch.Tensor) -> torch.Tensor:
+        config = self.config
+        log_density = raw[:, 0] + config.density_bias
+        if config.start_on_mesh:
+            near = 1 - (distance / config.mesh_falloff - config.mesh_skin).clamp(0, 1)
+            log_density = log_density + near * (config.mesh_density - config.density_bias)
         # the clamp also stops the gradient there, so that weights do not run away
-        limit = self.config.log_density_limit
-        log_density = torch.clamp(raw[:, 0] + self.config.density_bias, max=limit)
-        return torch.exp(log_density) * 1e3
+        return torch.exp(torch.clamp(log_density, max=config.log_density_limit)) * 1e3
 
-    def densities(self, samples: Samples, latent: torch.Tensor | None = None) -> torch.Tensor:
+    def densities(self, samples: Samples, worn: Worn | None = None) -> torch.Tensor:
         """Density alone [N], per metre: what a ray needs to know where it ends."""
-        return self._density(self._geometry(samples, self.latent if latent is None else latent)[0])
+        raw = self._geometry(samples, worn or self.worn)[0]
+        return self._density(raw, samples.distance)
 
     def forward(
-        self, samples: Samples, latent: torch.Tensor | None = None
+        self, samples: Samples, worn: Worn | None = None
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Density [N] per metre and colour [N, 3], sRGB in [0, 1].
 
-        `latent` stands in for the learned embeddings, e.g. a mixed one (see mixed_latent).
+        `worn` stands in for the learned appearances, e.g. a blend of them (see `blend`).
         """
-        latent = self.latent if latent is None else latent
-        raw, features, embedding = self._geometry(samples, latent)
+        raw, features, embedding = self._geometry(samples, worn or self.worn)
         inputs = torch.cat([embedding, raw, features], 1)
         view = directions.spherical_harmonics(samples.direction)
         colour = torch.sigmoid(self.colour(inputs, view, samples.ray))
-        return self._density(raw), colour
+        return self._density(raw, samples.distance), colour
 
-    def mixed_latent(self, weights: torch.Tensor) -> torch.Tensor:
-        """The latent features of a blend of appearances: weights [A] -> [1, ...]."""
-        return torch.tensordot(weights.to(self.latent), self.latent.detach(), 1)[None]
+    @property
+    def worn(self) -> Worn:
+        """The learned appearances themselves."""
+        return Worn(self.latent, self.code)
+
+    def blend(self, weights: torch.Tensor) -> Worn:
+        """A blend of the appearances by weights [A], as the only appearance there is."""
+        w = weights.to(self.latent)
+        return Worn(
+            torch.tensordot(w, self.latent.detach(), 1)[None],
+            torch.tensordot(w, self.code.detach(), 1)[None],
+        )

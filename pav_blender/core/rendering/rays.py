@@ -48,6 +48,7 @@ class Packed:
     triangle: torch.Tensor
     barycentric: torch.Tensor
     canonical: torch.Tensor
+    distance: torch.Tensor
 
     def __len__(self) -> int:
         return len(self.ray)
@@ -66,6 +67,7 @@ def pack(wave: Wave, jitter: torch.Tensor, step: float) -> Packed:
         wave.triangle.reshape(-1)[slots],
         wave.barycentric.reshape(-1, 3)[slots],
         wave.canonical.reshape(-1, 3)[slots],
+        wave.distance.reshape(-1)[slots],
     )
 
 
@@ -84,6 +86,7 @@ def samples_of(
         canonical=(packed.canonical - clearance.box_min) * clearance.box_scale,
         triangle=packed.triangle,
         barycentric=packed.barycentric,
+        distance=packed.distance,
         appearance=torch.full((count,), appearance, dtype=torch.int32),
         frame=torch.zeros(count, dtype=torch.int32),
         ray=packed.ray,

@@ -14,6 +14,7 @@ from ..deformation import Clearance, Deformer, PosedMesh, clearance
 from ..deformation.rigid import head_rotation
 from ..errors import Cancelled, InputError
 from ..field.avatar import Avatar
+from ..field.field import Worn
 from ..kernels.cpu.threads import torch_alone
 from .cameras import Camera
 from .rays import RayBatch, camera_rays, pack, samples_of
@@ -65,7 +66,7 @@ class Scene:
     clearance: Clearance
     rotation: np.ndarray
     expression: torch.Tensor
-    latent: torch.Tensor
+    worn: Worn
 
 
 _deformers: weakref.WeakKeyDictionary[Avatar, Deformer] = weakref.WeakKeyDictionary()
@@ -140,7 +141,7 @@ def pose_scene(
         space_of(avatar, rows),
         head_rotation(avatar.canonical_vertices, vertices, avatar.rigid_weights),
         torch.from_numpy(values.astype(np.float32)),
-        avatar.field.mixed_latent(torch.from_numpy(weights)),
+        avatar.field.blend(torch.from_numpy(weights)),
     )
 
 
@@ -212,7 +213,7 @@ def _trace(scene: Scene, rays: RayBatch, settings: RenderSettings) -> tuple[np.n
             samples = samples_of(
                 packed, scene.clearance, 0, scene.expression, part.directions, scene.rotation
             )
-            sigma, rgb = scene.avatar.field(samples, scene.latent)
+            sigma, rgb = scene.avatar.field(samples, scene.worn)
             ops.marching.composite_step(
                 sigma,
                 rgb,

@@ -180,12 +180,13 @@ def pick_samples(
                     packed.triangle[good],
                     packed.barycentric[good],
                     packed.canonical[good],
+                    packed.distance[good],
                 )
             )
         alive[rows] = (first[rows] <= last[rows]) & (left[rows] > _ENDED)
     if not kept:
         none = torch.zeros(0, dtype=torch.int32)
-        kept = [(none, torch.zeros(0), none, torch.zeros(0, 3), torch.zeros(0, 3))]
+        kept = [(none, torch.zeros(0), none, *[torch.zeros(0, 3)] * 2, torch.zeros(0))]
         looked = [(torch.zeros(0, dtype=torch.int64), torch.zeros(0), torch.zeros(0))]
     joined = [torch.cat(column) for column in zip(*kept, strict=True)]
     order = torch.argsort(joined[0], stable=True)
@@ -232,7 +233,7 @@ def _march_frames(
         packed.ray = rows[packed.ray.long()].int()
         parts.append(packed)
         all_rows.append(rows)
-    fields = ("ray", "t", "triangle", "barycentric", "canonical")
+    fields = ("ray", "t", "triangle", "barycentric", "canonical", "distance")
     joined = Packed(*(torch.cat([getattr(p, name) for p in parts]) for name in fields))
     return joined, torch.cat(all_rows)
 
@@ -250,6 +251,7 @@ def _samples(
         canonical=(packed.canonical - space.box_min) * space.box_scale,
         triangle=packed.triangle,
         barycentric=packed.barycentric,
+        distance=packed.distance,
         appearance=appearance[frame.long()],
         frame=frame,
         ray=ray,

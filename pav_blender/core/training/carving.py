@@ -12,8 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from ..deformation import Deformer, triangle_maps
+from ..rendering.rasterise import rasterise
 from .frames import Frame
 
 _MISSES = 0.12  # part of the pictures that may disagree: mattes and tracks are not exact
@@ -27,19 +29,58 @@ _REACH = {  # metres; regions that are not named may be covered by long hair
     "eyeballs": 0.03,
     "mouth_interior": 0.02,
 }
+_OUTLINES = 16  # frames an appearance in which the outline is measured
+_NEARBY = 0.05  # metres along which what an outline tells holds
+_MARGIN = 0.008
 _SOFTNESS = 2  # pixels the mattes are grown by
 _LARGEST_STRETCH = 3.0
 
 
-def reach_of(regions: dict[str, np.ndarray], vertices: int, farthest: float) -> np.ndarray:
-    """Metres from each vertex [V] that anything may be: beards and glasses keep to the face,
-    clothes to the torso, hair may stand off the rest by `farthest`. What lies before a face no matte can carve.
+def reach_of(
+    canonical: np.ndarray,
+    triangles: np.ndarray,
+    regions: dict[str, np.ndarray],
+    frames: list[Frame],
+    farthest: float,
+) -> np.ndarray:
+    """Metres from each vertex [V] that an appearance may stand off the mesh.
+
+    Measured where the mesh's outline shows: how far the matte goes beyond it. Vertices near an
+    outline take what was seen there, others what was seen most anywhere on hair. Beards and glasses
+    keep to the face and clothes to the torso, for what lies before those no matte can tell.
     """
-    reach = np.full(vertices, farthest, np.float32)
+    seen = np.full(len(canonical), -1.0, np.float32)
+    for frame in frames[:: max(1, -(-len(frames) // _OUTLINES))]:
+        _outline(frame, triangles, seen)
+    known = np.flatnonzero(seen >= 0)
+    limit = np.full(len(canonical), farthest, np.float32)
     for name, distance in _REACH.items():
         if name in regions:
-            reach[regions[name]] = min(distance, farthest)
-    return reach
+            limit[regions[name]] = min(distance, farthest)
+    if len(known) == 0:
+        return limit
+    tree = cKDTree(canonical[known])
+    found = tree.query_ball_point(canonical, _NEARBY)
+    free = known[limit[known] == farthest]
+    rest = seen[free].max() if len(free) else seen[known].max()
+    reach = np.array([seen[known[near]].max() if near else rest for near in found], np.float32)
+    return np.minimum(reach + _MARGIN, limit)
+
+
+def _outline(frame: Frame, triangles: np.ndarray, seen: np.ndarray) -> None:
+    """Raises `seen` [V] at the mesh's outline to how far the matte goes beyond it, metres."""
+    depth, triangle, _ = rasterise(frame.vertices, triangles, frame.camera)
+    covered = triangle >= 0
+    if not covered.any():
+        return
+    inner = covered & ~ndimage.binary_erosion(covered, border_value=1)
+    np.maximum.at(seen, triangles[triangle[inner]].reshape(-1), 0.0)
+    pixels, at = ndimage.distance_transform_edt(~covered, return_indices=True)
+    beyond = ~covered & (frame.rgba[..., 3] > 64)
+    foot = at[0][beyond], at[1][beyond]
+    metres = pixels[beyond] * depth[foot] / frame.camera.intrinsics[0, 0]
+    for corner in range(3):
+        np.maximum.at(seen, triangles[triangle[foot], corner], metres.astype(np.float32))
 
 
 def close_to(
@@ -103,7 +144,7 @@ def carve(
     A cell that no frame has in its picture goes too: nothing there could be learned.
     """
     side = box_size / cells
-    band = _band(canonical, triangles, _centres(cells, box_min, box_size), reach + side)
+    band = _band(canonical, triangles, _centres(cells, box_min, box_size), reach + side / 2)
     chosen = frames[:: max(1, -(-len(frames) // most_frames))]
     seen = np.zeros(len(band.row), np.int32)
     missed = np.zeros(len(band.row), np.int32)
@@ -111,7 +152,7 @@ def carve(
         _count(frame, _carry(canonical, frame, triangles, band), side, seen, missed)
     kept = np.zeros(cells**3, bool)
     kept[band.row] = (seen > 0) & (missed <= _MISSES * seen)
-    return ndimage.binary_dilation(kept.reshape((cells,) * 3))
+    return kept.reshape((cells,) * 3)
 
 
 @dataclass(eq=False)

@@ -64,8 +64,21 @@ class Visibility:
         looked = cells[seen > _SEEN]
         self.looks.index_add_(0, looked, torch.ones(len(looked)))
 
+    def _judge_blocks(self) -> None:
+        """Empties blocks of 2 x 2 x 2 cells that had looks enough together: at first there are
+        too many cells for the rays of a few batches."""
+        size = self.occupied.shape[1]
+        if size % 2:
+            return
+        blocks = (-1, size // 2, 2, size // 2, 2, size // 2, 2)
+        looks = self.looks.view(blocks).sum((2, 4, 6), keepdim=True)
+        weight = self.weight.view(blocks).amax((2, 4, 6), keepdim=True)
+        empty = (looks >= 2 * _LOOKS) & (weight < _LEAST_WEIGHT)
+        self.filled.view(blocks).logical_and_(~empty)
+
     def prune(self) -> float:
         """Empties cells that were looked at and added nothing; returns the part that is left."""
+        self._judge_blocks()
         judged = self.looks >= _LOOKS
         self.filled[judged] = self.weight[judged] >= _LEAST_WEIGHT
         self.unseen += (self.unseen < 255) & (self.looks == 0)

@@ -37,21 +37,18 @@ def new_avatar(collection: Collection, frames: list[Frame], config: Config) -> A
     """An untrained avatar whose space is carved by the mattes of the frames."""
     head = collection.head
     canonical = head.canonical(collection.betas)
-    reach = reach_of(head.regions, len(canonical), config.reach)
-    corner, size = hull_box(canonical, head.triangles, frames, reach)
+    groups = [
+        [f for f in frames if f.appearance == index] for index in range(len(collection.appearances))
+    ]
+    reaches = [
+        reach_of(canonical, head.triangles, head.regions, group, config.reach) for group in groups
+    ]
+    corner, size = hull_box(canonical, head.triangles, frames, np.max(reaches, axis=0))
     cells = config.occupancy_resolution
     coarse = -(-cells // 2)  # the hull is smooth: its cells may be twice as large
     hulls = [
-        carve(
-            canonical,
-            head.triangles,
-            [f for f in frames if f.appearance == index],
-            reach,
-            corner,
-            size * 2 * coarse / cells,
-            coarse,
-        )
-        for index in range(len(collection.appearances))
+        carve(canonical, head.triangles, group, reach, corner, size * 2 * coarse / cells, coarse)
+        for group, reach in zip(groups, reaches, strict=True)
     ]
     occupied = np.stack([_doubled(hull)[:cells, :cells, :cells] for hull in hulls])
     return Avatar.create(

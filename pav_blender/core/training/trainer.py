@@ -20,14 +20,14 @@ from .losses import Loss, losses
 from .occupancy import Visibility
 
 _FIRST_STEP = 8.0  # the first samples are this many times as far apart as the last
-_LOOKS_A_RAY = 32  # the step is as fine as this many looks a ray allow,
-_REFINED = 0.6  # up to this part of the schedule; from then on it is the finest
-_LOOKS = 1 << 16  # a batch has fewer rays while space is still full of fog
-_CARVED = 0.2  # part of the schedule in which space is emptied often
+_LOOKS_A_RAY = 24  # the step is as fine as this many looks a ray allow
+_LOOKS = 1 << 15  # looks a batch while space is full of fog: many small steps find the head sooner
+_CARVED = 0.5  # part of the schedule in which space is emptied often
 _PRUNE_EVERY = 40  # iterations, while there is much to empty
-_PRUNE_LATER = 400
+_PRUNE_LATER = 200
 _UNSEEN_REACH = 0.015  # metres from the mesh within which cells that no ray saw are kept
 _WARM_UP = 20
+_PRUNE_FROM = 0.15
 
 
 @dataclass
@@ -55,7 +55,7 @@ class Trainer:
         self.frames = frames
         self.minutes = minutes
         self.config: Config = avatar.config
-        self.status = Status(step=_FIRST_STEP * self.config.step, rays=self.config.rays // 4)
+        self.status = Status(step=_FIRST_STEP * self.config.step, rays=self.config.rays // 8)
         self.random = np.random.default_rng(self.config.seed)
         self.generator = torch.Generator().manual_seed(self.config.seed)
         box = avatar.box_min, avatar.box_size
@@ -144,22 +144,21 @@ class Trainer:
         """
         status, config = self.status, self.config
         a_ray = looks / max(rays, 1)
-        if self.done < _REFINED:
-            wanted = status.step / config.step * (max(a_ray, 1.0) / _LOOKS_A_RAY) ** 0.2
-            status.step = config.step * min(max(wanted, 1.0), _FIRST_STEP)
-        else:
-            status.step = config.step
-        status.rays = int(min(max(_LOOKS / max(a_ray, 1.0), config.rays / 4), config.rays))
+        wanted = status.step / config.step * (max(a_ray, 1.0) / _LOOKS_A_RAY) ** 0.2
+        status.step = config.step * min(max(wanted, 1.0), _FIRST_STEP)
+        status.rays = int(min(max(_LOOKS / max(a_ray, 1.0), config.rays / 8), config.rays))
 
     def _prunes_now(self) -> bool:
-        often = self.done < _CARVED or self.status.iteration < 10 * _PRUNE_EVERY
-        return self.status.iteration % (_PRUNE_EVERY if often else _PRUNE_LATER) == 0
+        often = self.done < _CARVED
+        every = _PRUNE_EVERY if often else _PRUNE_LATER
+        return self.done > _PRUNE_FROM and self.status.iteration % every == 0
 
     def _adam(self) -> None:
         config = self.config
         ops = kernels.select("cpu")
         step = self.status.iteration + 1
-        decay = config.final_learning_rate**self.done * min(1.0, step / _WARM_UP)
+        late = max(0.0, self.done - config.decay_from) / (1 - config.decay_from)
+        decay = config.final_learning_rate**late * min(1.0, step / _WARM_UP)
         for name, parameter in self.avatar.field.named_parameters():
             base = {
                 "offset": config.offset_learning_rate,
