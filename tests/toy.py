@@ -43,7 +43,7 @@ def make_toy(path: Path, *, frames: int = 8, size: int = 64, seed: int = 0) -> P
     centre = head.shaped(betas)[head.regions["face"]].mean(0)
     camera_to_world = np.eye(4)
     camera_to_world[:3, :3] = np.diag([1, -1, -1])
-    camera_to_world[:3, 3] = centre + [0, 0, 0.75]
+    camera_to_world[:3, 3] = centre + np.array([0, 0, 0.75])
     focal = 2.0 * size
     intrinsics = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
     camera = Camera(size, size, intrinsics, camera_to_world)

@@ -34,6 +34,7 @@ _waiting: list[View] = []
 _finished = threading.Event()
 _drawing = threading.Lock()  # one picture at a time; the renderer uses every core for each
 _rate = 20_000.0  # pixels a second, as measured
+_warm = False  # torch and the kernels are loaded: many seconds the first time, never in front
 _thread: threading.Thread | None = None
 
 
@@ -54,7 +55,8 @@ class View:
     def update(self, depsgraph: Any) -> None:
         """Takes a copy of what is to be drawn. Blender calls this for every edit of the file; one
         that does not concern the picture changes nothing."""
-        message, actors = "", ()
+        message = ""
+        actors: tuple[Any, ...] = ()
         try:
             requirements.check()
             actors = find_actors(depsgraph)
@@ -83,24 +85,30 @@ class View:
         whole = (0, 0, camera.width, camera.height)
         self.shot = Shot(self.actors, camera, whole, "preview", self.background, _CHUNK)
         # the thread's picture is of another view now: it stops within a chunk
-        self._next = _coarsest(camera)
-        with _drawing:
-            self._draw(self.shot, self._next)
-        if not self.message and self._next + 1 < len(_SHARES):
+        self._next = 0
+        if _warm:
+            self._next = _coarsest(camera)
+            with _drawing:
+                self._draw(self.shot, self._next)
             self._next += 1
+        else:
+            self.message = "Loading"
+        if self._next < len(_SHARES):
             _ask(self)
 
     def refine(self) -> None:
         """On the thread: the next finer picture, and so on until the view changes."""
         shot, share = self.shot, self._next
-        while shot is not None and shot is self.shot and share < len(_SHARES) and not self.message:
+        while shot is not None and shot is self.shot and share < len(_SHARES):
             with _drawing:
-                self._draw(shot, share)
+                good = self._draw(shot, share)
             _finished.set()
+            if not good:
+                return
             share += 1
 
-    def _draw(self, shot: Shot, share: int) -> None:
-        global _rate
+    def _draw(self, shot: Shot, share: int) -> bool:
+        global _rate, _warm
         part = _SHARES[share]
         camera = shot.camera.resized(
             max(1, round(shot.camera.width * part)), max(1, round(shot.camera.height * part))
@@ -111,13 +119,16 @@ class View:
         try:
             pixels = draw(smaller, should_stop=lambda: shot is not self.shot)
         except Cancelled:
-            return
+            return False
         except Exception as error:
             self.message = str(error) or type(error).__name__
-            return
-        _rate = camera.width * camera.height / max(time.perf_counter() - begun, 1e-4)
+            return False
+        if _warm:
+            _rate = camera.width * camera.height / max(time.perf_counter() - begun, 1e-4)
+        _warm = True
         if shot is self.shot:
-            self.pixels = pixels
+            self.pixels, self.message = pixels, ""
+        return True
 
 
 def view_camera(region: Any, region_data: Any) -> Camera:

@@ -101,10 +101,9 @@ class Config:
     @classmethod
     def preset(cls, name: str) -> Config:
         """ "default" or "paper"."""
-        presets = {"default": cls, "paper": cls.paper}
-        if name not in presets:
-            raise InputError(f"preset {name!r}: one of {', '.join(presets)}")
-        return presets[name]()
+        if name not in ("default", "paper"):
+            raise InputError(f"preset {name!r}: one of default, paper")
+        return cls.paper() if name == "paper" else cls()
 
     @property
     def embedding_channels(self) -> int:

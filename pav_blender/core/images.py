@@ -115,7 +115,7 @@ def write_exr(
     """Writes scene-linear premultiplied [H, W, 4] as half, with depth [H, W] as float `Z`."""
     oiio = _oiio()
     pixels = np.asarray(rgba, np.float32)
-    names = ("R", "G", "B", "A")
+    names: tuple[str, ...] = ("R", "G", "B", "A")
     kinds = [oiio.HALF] * 4
     if depth is not None:
         pixels = np.concatenate([pixels, np.asarray(depth, np.float32)[..., None]], axis=2)

@@ -15,7 +15,9 @@ EXAMPLE = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("avatar", type=Path, help="avatar file (.pav), or a scene (.blend)")
-    parser.add_argument("--track", metavar="COLLECTION:CLIP", help="the motion; a .blend has its own")
+    parser.add_argument(
+        "--track", metavar="COLLECTION:CLIP", help="the motion; a .blend has its own"
+    )
     parser.add_argument("--appearance", required=True, help="a name, or all")
     parser.add_argument(
         "--out", required=True, help="pictures: #### is the frame number, {appearance} the name"

@@ -90,6 +90,7 @@ def renderer(monkeypatch):
     monkeypatch.setattr(viewport, "draw", made)
     monkeypatch.setattr(viewport, "_ask", lambda view: None)
     monkeypatch.setattr(viewport, "_coarsest", lambda camera: 0)
+    monkeypatch.setattr(viewport, "_warm", True)
     return made
 
 
@@ -141,6 +142,17 @@ def test_refining_ends_when_the_view_moved_on(renderer):
 def test_the_first_picture_is_as_fine_as_can_be_waited_for(monkeypatch, rate, share):
     monkeypatch.setattr(viewport, "_rate", rate)
     assert viewport._coarsest(camera()) == share
+
+
+def test_loading_happens_on_the_thread(renderer, monkeypatch):
+    monkeypatch.setattr(viewport, "_warm", False)
+    view = viewport.View(actors=(object(),))
+    view.look(camera())
+    assert (renderer.sizes, view.message) == ([], "Loading")
+    view.refine()
+    assert (renderer.sizes, view.message) == ([40, 80, 160, 320], "")
+    view.look(camera(0.1))
+    assert renderer.sizes[-1] == 40
 
 
 def test_a_fault_becomes_the_views_message(renderer, monkeypatch):

@@ -38,9 +38,13 @@ def test_hidden_colours_are_written_as_zero(toy):
 
 
 def test_an_interrupted_writer_leaves_nothing(tmp_path):
-    with pytest.raises(RuntimeError), CollectionWriter(tmp_path / "c", "builtin", np.zeros(2)) as w:
-        w.image("a", 0, np.zeros((4, 4, 4), np.uint8))
-        raise RuntimeError("the studio broke")
+    def film():
+        with CollectionWriter(tmp_path / "c", "builtin", np.zeros(2)) as writer:
+            writer.image("a", 0, np.zeros((4, 4, 4), np.uint8))
+            raise RuntimeError("the studio broke")
+
+    with pytest.raises(RuntimeError):
+        film()
     assert list(tmp_path.iterdir()) == []
 
 

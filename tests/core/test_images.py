@@ -59,8 +59,13 @@ def test_bad_files_are_told_in_one_line(tmp_path, pixels):
 def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, pixels):
     write_rgba(tmp_path / "a.png", pixels)
     before = (tmp_path / "a.png").read_bytes()
-    with pytest.raises(RuntimeError), replacing(tmp_path / "a.png") as temporary:
-        temporary.write_bytes(b"half a file")
-        raise RuntimeError("the disk is full")
+
+    def fill():
+        with replacing(tmp_path / "a.png") as temporary:
+            temporary.write_bytes(b"half a file")
+            raise RuntimeError("the disk is full")
+
+    with pytest.raises(RuntimeError):
+        fill()
     assert (tmp_path / "a.png").read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["a.png"]

@@ -1,4 +1,4 @@
-"""Nearest triangle: the compiled search against trying every triangle, on kind and hostile meshes."""
+"""Nearest triangle: the compiled search against trying every triangle, on hostile meshes too."""
 
 from __future__ import annotations
 

@@ -57,7 +57,7 @@ def test_the_hull_holds_the_surface_and_leaves_out_what_no_matte_shows(toy, fram
     face = toy.head.canonical(toy.betas)[toy.head.regions["face"]]
     assert filled(0, face) > 0.99
     assert filled(1, face) > 0.99
-    assert filled(0, face + [0, 0, 0.06]) < 0.1
+    assert filled(0, face + np.array([0, 0, 0.06])) < 0.1
     assert 0.02 < avatar.occupied[0].mean() < 0.4
     assert avatar.occupied[1].sum() > avatar.occupied[0].sum()
 

@@ -126,9 +126,8 @@ def write_proof(
     width = max(len(claim.name) for claim in claims)
     for claim in claims:
         mark = "met" if claim.met else "NOT MET"
-        show(
-            f"{claim.name:{width}}  {claim.value:9.2f} {claim.unit:4} target {claim.target:g}  {mark}"
-        )
+        value = f"{claim.value:9.2f} {claim.unit:4} target {claim.target:g}"
+        show(f"{claim.name:{width}}  {value}  {mark}")
     return all(claim.met for claim in claims)
 
 

@@ -27,6 +27,6 @@ def grid(rows: list[list[np.ndarray]], *, gap: int = 4, background: float = 1.0)
 
 
 def error_map(picture: np.ndarray, truth: np.ndarray, *, full: float = 0.25) -> np.ndarray:
-    """Mean absolute error of [H, W, 3] pictures as black - red - yellow - white, white at `full`."""
+    """Mean absolute error of pictures [H, W, 3]: black, red, yellow, and white from `full` on."""
     error = np.clip(np.abs(picture - truth).mean(-1) / full, 0, 1)
     return np.clip(3 * error[..., None] - np.arange(3), 0, 1).astype(np.float32)

@@ -51,7 +51,7 @@ class Clearance:
 class Wave(NamedTuple):
     """Up to W occupied samples a ray; entries beyond `count` hold -1 (k, triangle) and zeros."""
 
-    count: torch.Tensor  # [R] int32
+    count: torch.Tensor  # type: ignore[assignment]  # [R] int32; hides tuple.count
     next: torch.Tensor  # [R] int32: lattice index to continue from, last + 1 when finished
     k: torch.Tensor  # [R,W] int32, lattice index: t = (k + jitter) * step
     triangle: torch.Tensor  # [R,W] int32

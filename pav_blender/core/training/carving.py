@@ -164,7 +164,9 @@ class _Band:
     triangle: np.ndarray
 
 
-def _band(canonical: np.ndarray, triangles: np.ndarray, points: np.ndarray, reach: float) -> _Band:
+def _band(
+    canonical: np.ndarray, triangles: np.ndarray, points: np.ndarray, reach: np.ndarray
+) -> _Band:
     deformer = Deformer(canonical, triangles, "affine")
     nearest = deformer.nearest(deformer.pose(canonical), torch.from_numpy(points))
     triangle, barycentric, distance = (values.numpy() for values in nearest)

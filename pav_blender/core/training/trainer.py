@@ -21,7 +21,7 @@ from .occupancy import Visibility
 
 _FIRST_STEP = 8.0  # the first samples are this many times as far apart as the last
 _LOOKS_A_RAY = 24  # the step is as fine as this many looks a ray allow
-_LOOKS = 1 << 15  # looks a batch while space is full of fog: many small steps find the head sooner
+_LOOKS = 1 << 15  # looks a batch in fog: many small steps find the head sooner
 _CARVED = 0.5  # part of the schedule in which space is emptied often
 _PRUNE_EVERY = 40  # iterations, while there is much to empty
 _PRUNE_LATER = 200
@@ -139,8 +139,8 @@ class Trainer:
     def _plan(self, looks: int, rays: int) -> None:
         """Sets the next batch's step and size from what the last one looked at.
 
-        While nothing is known of where the head ends, a ray passes much fog: few rays of few samples
-        find out as well, and far sooner.
+        While nothing is known of where the head ends, a ray passes much fog: few rays of few
+        samples find out as well, and far sooner.
         """
         status, config = self.status, self.config
         a_ray = looks / max(rays, 1)
@@ -172,13 +172,15 @@ class Trainer:
                 "beta2": config.beta2,
                 "eps": config.epsilon,
             }
-            if parameter.numel() == 0:
+            grad = parameter.grad
+            if grad is None or parameter.numel() == 0:
                 continue
             if name == "latent" and config.appearance == "surface":
-                rows = [x.view(-1, x.shape[-1]) for x in (parameter.data, parameter.grad, m, v)]
+                values = (parameter.data, grad, m, v)
+                rows = [x.view(-1, x.shape[-1]) for x in values]
                 ops.optimiser.sparse_adam_step(*rows, **settings)
             else:
-                ops.optimiser.adam_step(parameter.data, parameter.grad, m, v, **settings)
+                ops.optimiser.adam_step(parameter.data, grad, m, v, **settings)
 
     def _note(self, loss: Loss, samples: float) -> None:
         status = self.status

@@ -77,7 +77,7 @@ def _set_cache() -> None:
     os.environ["NUMBA_CACHE_DIR"] = folder = _choose_cache()
     loaded = sys.modules.get("numba.core.config")
     if loaded is not None and not loaded.CACHE_DIR:  # the host imported numba before us
-        loaded.CACHE_DIR = folder
+        setattr(loaded, "CACHE_DIR", folder)  # noqa: B010  (a module's attribute, unknown to mypy)
 
 
 _set_cache()
