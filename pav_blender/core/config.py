@@ -59,6 +59,7 @@ class Config:
     learning_rate: float = 5e-3
     offset_learning_rate: float = 5e-3
     table_learning_rate: float = 1e-2  # of the hash encoding
+    latent_learning_rate: float = 1.5e-2  # of the appearances' features
     beta1: float = 0.9
     beta2: float = 0.99
     epsilon: float = 1e-15
@@ -95,6 +96,7 @@ class Config:
             learning_rate=2.5e-3,
             offset_learning_rate=2.5e-4,
             table_learning_rate=2.5e-3,
+            latent_learning_rate=2.5e-3,
             final_learning_rate=1.0,
         )
 

@@ -125,7 +125,8 @@ class Field(nn.Module):
         self.latent = nn.Parameter(torch.randn(shape) * 0.1)
         # what an appearance's features have in common: every sample teaches it, so that
         # appearances part company long before each vertex was seen often
-        codes = config.latent_channels if config.appearance_code else 0
+        mapped = config.appearance in ("vertex", "surface")
+        codes = config.latent_channels if config.appearance_code and mapped else 0
         self.code = nn.Parameter(torch.randn(appearances, codes) * 0.5)
         embedding, geometry = config.embedding_channels, config.geometry_channels
         self.density = Mlp(

@@ -16,6 +16,7 @@ from ..rendering.render import clearance_of
 
 _SEEN = 0.1  # transmittance from which a look at a cell counts
 _LOOKS = 8.0  # looks after which a cell is judged
+_BLOCK_LOOKS = 16.0  # the same for eight cells together
 _LEAST_WEIGHT = 2e-3  # a millimetre; untrained fog has about twice that
 _HIDDEN = 12  # rounds without a look after which a cell counts as hidden
 
@@ -65,24 +66,27 @@ class Visibility:
         self.looks.index_add_(0, looked, torch.ones(len(looked)))
 
     def _judge_blocks(self) -> None:
-        """Empties blocks of 2 x 2 x 2 cells that had looks enough together: at first there are
-        too many cells for the rays of a few batches."""
+        """Empties blocks of 2 x 2 x 2 cells that had looks enough together: there are too many
+        cells for the rays of a few batches. What was judged is forgotten, so that old fog does not
+        speak for a cell for ever."""
         size = self.occupied.shape[1]
         if size % 2:
             return
-        blocks = (-1, size // 2, 2, size // 2, 2, size // 2, 2)
-        looks = self.looks.view(blocks).sum((2, 4, 6), keepdim=True)
-        weight = self.weight.view(blocks).amax((2, 4, 6), keepdim=True)
-        empty = (looks >= 2 * _LOOKS) & (weight < _LEAST_WEIGHT)
-        self.filled.view(blocks).logical_and_(~empty)
+        shape = (-1, size // 2, 2, size // 2, 2, size // 2, 2)
+        looks, weight = self.looks.view(shape), self.weight.view(shape)
+        judged = looks.sum((2, 4, 6), keepdim=True) >= _BLOCK_LOOKS
+        filled = weight.amax((2, 4, 6), keepdim=True) >= _LEAST_WEIGHT
+        self.filled.view(shape).logical_and_(filled | ~judged)
+        weight.mul_(~judged)
+        looks.mul_(~judged)
 
     def prune(self) -> float:
         """Empties cells that were looked at and added nothing; returns the part that is left."""
-        self._judge_blocks()
-        judged = self.looks >= _LOOKS
-        self.filled[judged] = self.weight[judged] >= _LEAST_WEIGHT
         self.unseen += (self.unseen < 255) & (self.looks == 0)
         self.unseen[self.looks > 0] = 0
+        judged = self.looks >= _LOOKS
+        self.filled[judged] = self.weight[judged] >= _LEAST_WEIGHT
+        self._judge_blocks()
         shape = self.occupied.shape
         hidden = (self.unseen >= _HIDDEN).numpy().reshape(shape) & ~self._near
         filled = self.filled.numpy().reshape(shape) & ~hidden

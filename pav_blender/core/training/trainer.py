@@ -163,6 +163,8 @@ class Trainer:
             base = {
                 "offset": config.offset_learning_rate,
                 "tables": config.table_learning_rate,
+                "latent": config.latent_learning_rate,
+                "code": config.latent_learning_rate,
             }.get(name.partition(".")[0], config.learning_rate)
             m, v = self.moments[name]
             settings = {
