@@ -102,7 +102,7 @@ def test_training_learns_the_person_and_tells_the_appearances_apart(toy, toy_ava
 
 def test_space_is_emptied_while_learning(toy, frames, toy_avatar, small_config):
     before = new_avatar(toy, frames, small_config).occupied.mean()
-    assert toy_avatar.occupied.mean() < 0.8 * before
+    assert 0.3 * before < toy_avatar.occupied.mean() < 0.97 * before
 
 
 def test_the_same_seed_gives_the_same_weights(toy, small_config, tmp_path):

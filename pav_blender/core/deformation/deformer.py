@@ -34,7 +34,7 @@ class Deformer:
         self.mode = mode
         self.device = device
         self.canonical_vertices = self._floats(canonical_vertices)
-        self.triangles = torch.as_tensor(triangles).to(device, torch.int32).contiguous()
+        self.triangles = torch.as_tensor(np.array(triangles), dtype=torch.int32, device=device)
         count = len(self.canonical_vertices)
         if (
             len(self.triangles)

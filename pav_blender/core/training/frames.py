@@ -56,6 +56,8 @@ def load_frames(
     progress: Report | None = None,
 ) -> list[Frame]:
     """Reads `rows` of a clip. `targets=False` leaves out the depth (zeros) and is faster."""
+    if len(rows) == 0:
+        return []
     appearance = collection.appearances.index(clip.appearance)
     face = _face_triangles(collection)
     posed = collection.posed(clip, rows)
