@@ -1,0 +1,49 @@
+"""Run inside Blender's window: the PAV tab open, the camera's view, Rendered shading.
+
+    blender out/demo/avatar.blend --python tools/show_panel.py
+
+For pictures of the real window in docs/. The sidebar's tab can be chosen only once it was drawn, so
+this tries again for a while.
+"""
+
+from __future__ import annotations
+
+import bpy
+
+_TRIES = 40
+_tried = 0
+
+
+def show() -> float | None:
+    """Sets up every 3D view; called by a timer until it has had its tries."""
+    global _tried
+    _tried += 1
+    bpy.context.preferences.view.show_splash = False
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type == "VIEW_3D":
+                show_view(area)
+            elif area.type == "PROPERTIES":
+                area.spaces.active.context = "RENDER"
+    heads = [thing for thing in bpy.context.scene.objects if thing.pav.avatar]
+    if heads:
+        bpy.context.view_layer.objects.active = heads[0]
+    return 0.5 if _tried < _TRIES else None
+
+
+def show_view(area) -> None:
+    """One 3D view: sidebar, camera, shading."""
+    space = area.spaces.active
+    space.show_region_ui = True
+    space.region_3d.view_perspective = "CAMERA"
+    space.shading.type = "RENDERED"
+    for region in area.regions:
+        if region.type == "UI" and region.active_panel_category != "PAV":
+            try:
+                region.active_panel_category = "PAV"
+            except (AttributeError, TypeError):
+                continue  # not drawn yet
+    area.tag_redraw()
+
+
+bpy.app.timers.register(show, first_interval=0.5)
