@@ -37,11 +37,23 @@ __all__ = [
     "resolutions",
     "table_sizes",
     "texels_read",
+    "warm_up",
 ]
 
 CHUNK = 4096  # samples of a latent read handed to a thread at a time
 # Not "nnan" or "ninf": points may be anything.
 FAST = {"contract", "reassoc", "nsz", "arcp"}
+
+
+def warm_up() -> None:
+    """Compile what rendering needs; see the package's `warm_up`."""
+    layout = Layout(levels=2, log2_entries=3, base=1, finest=2)  # one level dense, one hashed
+    point, index = torch.zeros(1, 3), torch.zeros(1, dtype=torch.int32)
+    with torch.inference_mode():
+        encode(point, torch.zeros(layout.entries, FEATURES), layout)
+        read_texture(torch.zeros(1, 1, 1, 1), index, point[:, :2])
+        triangles = torch.zeros(1, 3, dtype=torch.int32)
+        read_vertices(torch.zeros(1, 1, 1), index, triangles, index, point)
 
 
 def encode(
