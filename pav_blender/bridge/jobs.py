@@ -16,6 +16,7 @@ import bpy
 
 from ..core.errors import PavError
 
+TRAINING, WRITING = "Training", "Writing frames"
 _INTERVAL_S = 0.2
 
 

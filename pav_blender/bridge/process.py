@@ -59,7 +59,7 @@ class Process:
         while not self._said.empty():
             self._take(self._said.get())
         if over and not self.error and self._child.returncode != 0:
-            self.error = "Cancelled" if self._stopping else self._last_words()
+            self.error = self._last_words()
         return over
 
     def wait(self) -> None:
@@ -107,6 +107,10 @@ class Process:
 
     def _last_words(self) -> str:
         last = self.lines[-1] if self.lines else "it said nothing"
+        if last.startswith("pav: "):  # the one line that says it all
+            return last[5:]
+        if self._stopping:
+            return "Cancelled"
         return f"pav {self.arguments[0]} ended with code {self._child.returncode}: {last}"
 
 

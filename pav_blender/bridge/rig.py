@@ -117,6 +117,7 @@ def _build_armature(head: HeadModel, betas: np.ndarray, name: str, collection: A
     view_layer.objects.active = before
     for bone in object_.pose.bones:
         bone.rotation_mode = "QUATERNION"
+    data.display_type = "STICK"  # hides the least of the face
     object_.show_in_front = True
     return object_
 

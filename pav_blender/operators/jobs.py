@@ -33,7 +33,7 @@ class PAV_OT_train(bpy.types.Operator):
         collection, output = avatars.resolve(settings.collection), avatars.resolve(settings.output)
         arguments = ["train", str(collection), "--out", str(output), "--json-progress"]
         arguments += shlex.split(settings.arguments)
-        jobs.start("Training", lambda: Process(arguments), f"Wrote {output}")
+        jobs.start(jobs.TRAINING, lambda: Process(arguments), f"Wrote {output}")
         return {"FINISHED"}
 
 
@@ -51,9 +51,7 @@ class PAV_OT_write_sequence(bpy.types.Operator):
     def execute(self, context: Any) -> set[str]:
         scene = context.scene
         folder = Path(bpy.path.abspath(scene.render.filepath))
-        jobs.start(
-            "Writing frames", lambda: sequence.begin(scene, folder), f"Frames are in {folder}"
-        )
+        jobs.start(jobs.WRITING, lambda: sequence.begin(scene, folder), f"Frames are in {folder}")
         return {"FINISHED"}
 
 

@@ -62,7 +62,7 @@ class PAV_PT_train(_Sidebar, bpy.types.Panel):
         column.prop(context.scene.pav, "output")
         column.prop(context.scene.pav, "arguments")
         column.operator("pav.train", icon="PLAY")
-        _draw_job(column)
+        _draw_job(column, jobs.TRAINING)
 
 
 class PAV_PT_frames(_Sidebar, bpy.types.Panel):
@@ -75,7 +75,7 @@ class PAV_PT_frames(_Sidebar, bpy.types.Panel):
         column.prop(context.scene.pav, "quality")
         column.prop(context.scene.render, "filepath", text="Folder")
         column.operator("pav.write_sequence", icon="RENDER_ANIMATION")
-        _draw_job(column)
+        _draw_job(column, jobs.WRITING)
 
 
 class PAV_PT_render(bpy.types.Panel):
@@ -111,12 +111,12 @@ def _draw_missing(layout: Any) -> None:
     box.label(text="or start Blender with PYTHONPATH set")
 
 
-def _draw_job(layout: Any) -> None:
+def _draw_job(layout: Any, name: str) -> None:
     job = jobs.current()
-    if job is None:
+    if job is None or job.name != name:
         return
     if job.running:
-        layout.progress(factor=job.work.fraction, text=f"{job.name}: {job.status}")
+        layout.progress(factor=job.work.fraction, text=job.status)
         layout.operator("pav.cancel_job", icon="CANCEL")
     else:
         layout.label(text=job.status, icon="ERROR" if job.work.error else "CHECKMARK")
