@@ -11,7 +11,7 @@ import bpy
 import numpy as np
 
 from ..core.errors import Cancelled, PavError
-from . import requirements
+from . import requirements, turns
 from .render import Pixels, draw
 from .shot import Shot, read_shot
 
@@ -27,7 +27,8 @@ def render(engine: Any, depsgraph: Any) -> None:
         requirements.check()
         shot = read_shot(engine, depsgraph)
         engine.update_stats("", f"PAV: {shot.camera.width}x{shot.camera.height}")
-        pixels = draw(shot, engine.update_progress, engine.test_break)
+        with turns.first():
+            pixels = draw(shot, engine.update_progress, engine.test_break)
     except Cancelled:
         return
     except Exception as error:

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..core.errors import Cancelled, InputError, PavError
 from ..core.rendering.colour import linear_to_srgb
-from . import requirements
+from . import requirements, turns
 from .render import Pixels, draw
 from .shot import Shot, read_shot
 
@@ -47,7 +47,7 @@ class Sequence:
 
     @property
     def message(self) -> str:
-        return self.error or f"Frame {self.first + self.done} of {self.last}"
+        return self.error or f"Frame {min(self.first + self.done, self.last)} of {self.last}"
 
     @property
     def finished(self) -> bool:
@@ -91,7 +91,8 @@ class Sequence:
         from ..core import images
 
         try:
-            pixels = draw(shot, should_stop=self.stopping.is_set)
+            with turns.first():
+                pixels = draw(shot, should_stop=self.stopping.is_set)
             images.write_rgba(path, display(shot, pixels), metadata={"Software": "pav_blender"})
             self.done += 1
         except Cancelled:

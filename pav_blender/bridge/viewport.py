@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import threading
 import time
-from dataclasses import dataclass, field, replace
+import weakref
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import bpy
@@ -17,7 +19,7 @@ import numpy as np
 
 from ..core.errors import Cancelled, PavError
 from ..core.rendering.cameras import Camera
-from . import requirements
+from . import requirements, turns
 from .axes import camera_to_core
 from .lens import from_projection
 from .render import Pixels, draw
@@ -29,10 +31,9 @@ _CHUNK = 2048
 _POLL_S = 1 / 30
 _SHARES = (1 / 8, 1 / 4, 1 / 2, 1)  # of the view's sides
 
-_wake = threading.Condition()
-_waiting: list[View] = []
+_waiting: list[weakref.ref[View]] = []  # guarded by turns.changed
 _finished = threading.Event()
-_drawing = threading.Lock()  # one picture at a time; the renderer uses every core for each
+_drawing = threading.Lock()  # one picture at a time: the renderer uses every core for each
 _rate = 20_000.0  # pixels a second, as measured
 _warm = False  # torch and the kernels are loaded: many seconds the first time, never in front
 _thread: threading.Thread | None = None
@@ -40,7 +41,8 @@ _thread: threading.Thread | None = None
 
 @dataclass(eq=False)
 class View:
-    """The state of one rendered 3D view. `shot` is what it should show, `pixels` what it has."""
+    """The state of one rendered 3D view. `shot` is what it should show, `pixels` what it has,
+    `share` the number in _SHARES of the next picture."""
 
     actors: tuple[Actor, ...] = ()
     background: tuple[float, float, float] | None = None
@@ -50,7 +52,7 @@ class View:
     changed: bool = True
     shown: Pixels | None = None
     texture: Any = None
-    _next: int = field(default=0)
+    share: int = 0
 
     def update(self, depsgraph: Any) -> None:
         """Takes a copy of what is to be drawn. Blender calls this for every edit of the file; one
@@ -84,51 +86,81 @@ class View:
         self.changed = False
         whole = (0, 0, camera.width, camera.height)
         self.shot = Shot(self.actors, camera, whole, "preview", self.background, _CHUNK)
-        # the thread's picture is of another view now: it stops within a chunk
-        self._next = 0
+        self.share = 0
         if _warm:
-            self._next = _coarsest(camera)
-            with _drawing:
-                self._draw(self.shot, self._next)
-            self._next += 1
+            self.share = _coarsest(camera)
+            with turns.first(), _drawing:
+                self.take(self.shot, *_draw(self.shot, self.share, lambda: False))
         else:
             self.message = "Loading"
-        if self._next < len(_SHARES):
-            _ask(self)
+        if self.share < len(_SHARES):
+            _ask(weakref.ref(self))
 
-    def refine(self) -> None:
-        """On the thread: the next finer picture, and so on until the view changes."""
-        shot, share = self.shot, self._next
-        while shot is not None and shot is self.shot and share < len(_SHARES):
-            with _drawing:
-                good = self._draw(shot, share)
-            _finished.set()
-            if not good:
-                return
-            share += 1
+    def take(self, shot: Shot, pixels: Pixels | None, message: str) -> None:
+        """Accepts a picture (or what went wrong) if it still shows what it should."""
+        if shot is not self.shot:
+            return
+        self.message = message
+        if pixels is not None:
+            self.pixels = pixels
+            self.share += 1
+        else:
+            self.share = len(_SHARES)  # no finer picture will go better
 
-    def _draw(self, shot: Shot, share: int) -> bool:
-        global _rate, _warm
-        part = _SHARES[share]
-        camera = shot.camera.resized(
-            max(1, round(shot.camera.width * part)), max(1, round(shot.camera.height * part))
-        )
-        region = (0, 0, camera.width, camera.height)
-        smaller = replace(shot, camera=camera, region=region)
-        begun = time.perf_counter()
-        try:
-            pixels = draw(smaller, should_stop=lambda: shot is not self.shot)
-        except Cancelled:
-            return False
-        except Exception as error:
-            self.message = str(error) or type(error).__name__
-            return False
-        if _warm:
-            _rate = camera.width * camera.height / max(time.perf_counter() - begun, 1e-4)
-        _warm = True
-        if shot is self.shot:
-            self.pixels, self.message = pixels, ""
-        return True
+
+def _draw(shot: Shot, share: int, should_stop: Callable[[], bool]) -> tuple[Pixels | None, str]:
+    """A share of a shot's pixels, or what went wrong. Cancelled where `should_stop` said so."""
+    global _rate, _warm
+    part = _SHARES[share]
+    camera = shot.camera.resized(
+        max(1, round(shot.camera.width * part)), max(1, round(shot.camera.height * part))
+    )
+    region = (0, 0, camera.width, camera.height)
+    begun = time.perf_counter()
+    try:
+        pixels = draw(replace(shot, camera=camera, region=region), should_stop=should_stop)
+    except Cancelled:
+        raise
+    except Exception as error:
+        return None, str(error) or type(error).__name__
+    if _warm:
+        _rate = camera.width * camera.height / max(time.perf_counter() - begun, 1e-4)
+    _warm = True
+    return pixels, ""
+
+
+def refine(owner: weakref.ref[View]) -> None:
+    """On the thread: the next finer picture of a view, and so on until it changes or is closed.
+
+    Only a weak reference is held: Blender drops the engine, and with it the view, at every switch
+    of shading. What goes before interrupts; the picture is then asked for again.
+    """
+    while _refine_once(owner):
+        _finished.set()
+
+
+def _refine_once(owner: weakref.ref[View]) -> bool:
+    view = owner()
+    if view is None or view.shot is None or view.share >= len(_SHARES):
+        return False
+    shot, share = view.shot, view.share
+    del view
+    try:
+        with _drawing:
+            outcome = _draw(shot, share, lambda: turns.wanted() or not _current(owner, shot))
+    except Cancelled:
+        if _current(owner, shot):
+            _ask(owner)
+        return False
+    view = owner()
+    if view is not None:
+        view.take(shot, *outcome)
+    return view is not None
+
+
+def _current(owner: weakref.ref[View], shot: Shot) -> bool:
+    view = owner()
+    return view is not None and view.shot is shot
 
 
 def view_camera(region: Any, region_data: Any) -> Camera:
@@ -163,6 +195,8 @@ def draw_view(engine: Any, view: View, context: Any, scene: Any) -> None:
     from gpu_extras.presets import draw_texture_2d
 
     view.look(view_camera(context.region, context.region_data))
+    if not bpy.app.timers.is_registered(_poll):
+        bpy.app.timers.register(_poll, persistent=True)
     engine.update_stats("PAV", view.message)
     pixels = view.pixels
     if pixels is None:
@@ -197,25 +231,24 @@ def _same(one: Camera, other: Camera) -> bool:
     )
 
 
-def _ask(view: View) -> None:
+def _ask(owner: weakref.ref[View]) -> None:
     global _thread
-    with _wake:
-        _waiting[:] = [other for other in _waiting if other is not view] + [view]
-        _wake.notify()
+    with turns.changed:
+        if owner not in _waiting:
+            _waiting.append(owner)
+        turns.changed.notify_all()
     if _thread is None:
         _thread = threading.Thread(target=_work, daemon=True)
         _thread.start()
-    if not bpy.app.timers.is_registered(_poll):
-        bpy.app.timers.register(_poll, persistent=True)
 
 
 def _work() -> None:
     while True:
-        with _wake:
-            while not _waiting:
-                _wake.wait()
-            view = _waiting.pop(0)
-        view.refine()
+        with turns.changed:
+            while not _waiting or turns.wanted():
+                turns.changed.wait()
+            owner = _waiting.pop(0)
+        refine(owner)
 
 
 def _poll() -> float:
@@ -231,5 +264,5 @@ def _poll() -> float:
 def unregister() -> None:
     if bpy.app.timers.is_registered(_poll):
         bpy.app.timers.unregister(_poll)
-    with _wake:
+    with turns.changed:
         _waiting.clear()

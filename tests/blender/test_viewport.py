@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 import time
+import weakref
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,7 +14,7 @@ pytest.importorskip("bpy")
 
 from mathutils import Matrix, Vector
 
-from pav_blender.bridge import axes, viewport
+from pav_blender.bridge import axes, turns, viewport
 from pav_blender.bridge.render import Pixels
 from pav_blender.core.errors import Cancelled
 from pav_blender.core.rendering.cameras import Camera
@@ -71,6 +73,7 @@ class Renderer:
 
     def __init__(self):
         self.sizes = []
+        self.asked = []
         self.delay = 0.0
 
     def __call__(self, shot, should_stop):
@@ -88,7 +91,7 @@ class Renderer:
 def renderer(monkeypatch):
     made = Renderer()
     monkeypatch.setattr(viewport, "draw", made)
-    monkeypatch.setattr(viewport, "_ask", lambda view: None)
+    monkeypatch.setattr(viewport, "_ask", made.asked.append)
     monkeypatch.setattr(viewport, "_coarsest", lambda camera: 0)
     monkeypatch.setattr(viewport, "_warm", True)
     return made
@@ -100,11 +103,15 @@ def camera(shift=0.0):
     return Camera(WIDTH, HEIGHT, np.diag([300.0, 300, 1]), pose)
 
 
+def refine(view):
+    viewport.refine(weakref.ref(view))
+
+
 def test_coarse_first_then_finer_then_nothing(renderer):
     view = viewport.View(actors=(object(),))
     view.look(camera())
     assert renderer.sizes == [40]
-    view.refine()
+    refine(view)
     assert renderer.sizes == [40, 80, 160, 320]
     assert view.pixels.depth.shape == (HEIGHT, WIDTH)
     view.look(camera())
@@ -120,22 +127,48 @@ def test_a_moved_camera_and_changed_data_begin_again(renderer):
     assert renderer.sizes == [40, 40, 40]
 
 
-def test_refining_ends_when_the_view_moved_on(renderer):
-    import threading
-
-    view = viewport.View(actors=(object(),))
-    view.look(camera())
+def start_refining(renderer, view):
+    """Begins a refinement on a thread that would take 20 s; the time when it had begun."""
     renderer.delay = 20.0
-    thread = threading.Thread(target=view.refine)
-    thread.start()
+    threading.Thread(target=viewport.refine, args=(weakref.ref(view),), daemon=True).start()
     while len(renderer.sizes) < 2:
         time.sleep(0.001)
-    begun = time.monotonic()
+    return time.monotonic()
+
+
+def test_refining_ends_when_the_view_moved_on(renderer):
+    view = viewport.View(actors=(object(),))
+    view.look(camera())
+    begun = start_refining(renderer, view)
     view.look(camera(0.1))
-    thread.join(10)
     assert time.monotonic() - begun < 5
-    assert renderer.sizes[:3] == [40, 80, 40]
+    assert renderer.sizes == [40, 80, 40]
     assert view.pixels.depth.shape[1] == 40
+
+
+def test_a_closed_view_does_not_keep_the_next_one_waiting(renderer):
+    """Blender drops the engine, and its view, at every switch of shading."""
+    old = viewport.View(actors=(object(),))
+    old.look(camera())
+    begun = start_refining(renderer, old)
+    del old
+    new = viewport.View(actors=(object(),))
+    new.look(camera())
+    assert time.monotonic() - begun < 5
+    assert new.pixels.depth.shape[1] == 40
+
+
+def test_refining_steps_aside_and_is_asked_for_again(renderer):
+    view = viewport.View(actors=(object(),))
+    view.look(camera())
+    renderer.asked.clear()
+    begun = start_refining(renderer, view)
+    with turns.first():
+        while not renderer.asked:
+            assert time.monotonic() - begun < 5
+            time.sleep(0.001)
+    assert renderer.asked == [weakref.ref(view)]
+    assert view.share == 1
 
 
 @pytest.mark.parametrize(("rate", "share"), [(1e2, 0), (100_000, 1), (1e9, 3)])
@@ -149,7 +182,7 @@ def test_loading_happens_on_the_thread(renderer, monkeypatch):
     view = viewport.View(actors=(object(),))
     view.look(camera())
     assert (renderer.sizes, view.message) == ([], "Loading")
-    view.refine()
+    refine(view)
     assert (renderer.sizes, view.message) == ([40, 80, 160, 320], "")
     view.look(camera(0.1))
     assert renderer.sizes[-1] == 40
