@@ -127,9 +127,10 @@ def use_engine(scene: Any) -> None:
     scene.render.engine = ENGINE
     scene.render.film_transparent = True
     scene.render.dither_intensity = 0.0
-    scene.render.image_settings.file_format = "PNG"
-    scene.render.image_settings.color_mode = "RGBA"
-    scene.render.image_settings.color_depth = "8"
+    settings = scene.render.image_settings
+    if hasattr(settings, "media_type"):  # Blender 5: the formats on offer depend on it
+        settings.media_type = "IMAGE"
+    settings.file_format, settings.color_mode, settings.color_depth = "PNG", "RGBA", "8"
     scene.display_settings.display_device = "sRGB"
     view = scene.view_settings
     view.view_transform, view.look = "Standard", "None"

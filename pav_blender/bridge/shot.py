@@ -79,10 +79,13 @@ def border(render: Any, width: int, height: int) -> tuple[int, int, int, int]:
 
 def world_colour(world: Any) -> tuple[float, float, float]:
     """Scene-linear colour behind the avatar: the world's background colour, black without one."""
+    import bpy
+
     if world is None:
         return 0.0, 0.0, 0.0
-    nodes = world.node_tree.nodes if world.use_nodes and world.node_tree else ()
-    for node in nodes:
+    # from Blender 5 on every world has nodes, and asking whether it uses them is deprecated
+    uses_nodes = world.node_tree and (bpy.app.version >= (5, 0, 0) or world.use_nodes)
+    for node in world.node_tree.nodes if uses_nodes else ():
         if node.type == "BACKGROUND" and not node.inputs["Color"].is_linked:
             strength = node.inputs["Strength"].default_value
             return tuple(strength * channel for channel in node.inputs["Color"].default_value[:3])
