@@ -146,9 +146,7 @@ def _scene(args: argparse.Namespace, collection: Any, steps: Steps) -> None:
                 motion, collection.head_name, collection.betas, overwrite=motion.exists()
             ) as writer:
                 writer.clip(clip)
-            _child(
-                "scene", out / "avatar.pav", "--track", f"{motion}:{clip.name}", "--out", blend
-            )
+            _child("scene", out / "avatar.pav", "--track", f"{motion}:{clip.name}", "--out", blend)
     wanted = [
         out / "frames" / name / f"{frame:04d}.png"
         for name in collection.appearances

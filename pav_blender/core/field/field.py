@@ -163,12 +163,17 @@ class Field(nn.Module):
             return features
         return features + worn.code[samples.appearance.long()]
 
+    def encode(self, samples: Samples) -> torch.Tensor:
+        """phi(x_c) [N, levels * 2]."""
+        ops = kernels.select(self.tables.device)
+        return ops.encoding.encode(samples.canonical, self.tables, self.layout)
+
     def _geometry(
-        self, samples: Samples, worn: Worn
+        self, samples: Samples, worn: Worn, encoded: torch.Tensor | None = None
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Log-density before its bias [N, 1], geometry features [N, C - 1], embedding Z^x."""
-        ops = kernels.select(self.tables.device)
-        encoded = ops.encoding.encode(samples.canonical, self.tables, self.layout)
+        if encoded is None:
+            encoded = self.encode(samples)
         geometry = self.density(encoded, samples.expression, samples.frame)
         raw, features = geometry[:, :1], geometry[:, 1:]
         embedding = self.embedding(samples, worn)
@@ -178,12 +183,17 @@ class Field(nn.Module):
             raw = raw + self.offset(seen, samples.expression, samples.frame)
         return raw, features, embedding
 
+    def untrained(self, distance: torch.Tensor) -> torch.Tensor:
+        """Log-density a millimetre of an untrained field, metres from the mesh."""
+        config = self.config
+        if not config.start_on_mesh:
+            return torch.full_like(distance, config.density_bias)
+        near = 1 - (distance / config.mesh_falloff - config.mesh_skin).clamp(0, 1)
+        return config.density_bias + near * (config.mesh_density - config.density_bias)
+
     def _density(self, raw: torch.Tensor, distance: torch.Tensor) -> torch.Tensor:
         config = self.config
-        log_density = raw[:, 0] + config.density_bias
-        if config.start_on_mesh:
-            near = 1 - (distance / config.mesh_falloff - config.mesh_skin).clamp(0, 1)
-            log_density = log_density + near * (config.mesh_density - config.density_bias)
+        log_density = raw[:, 0] + self.untrained(distance)
         # the clamp also stops the gradient there, so that weights do not run away
         return torch.exp(torch.clamp(log_density, max=config.log_density_limit)) * 1e3
 
@@ -193,13 +203,14 @@ class Field(nn.Module):
         return self._density(raw, samples.distance)
 
     def forward(
-        self, samples: Samples, worn: Worn | None = None
+        self, samples: Samples, worn: Worn | None = None, encoded: torch.Tensor | None = None
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Density [N] per metre and colour [N, 3], sRGB in [0, 1].
 
-        `worn` stands in for the learned appearances, e.g. a blend of them (see `blend`).
+        `worn` stands in for the learned appearances, e.g. a blend of them (see `blend`);
+        `encoded` for phi(x_c), where it is at hand.
         """
-        raw, features, embedding = self._geometry(samples, worn or self.worn)
+        raw, features, embedding = self._geometry(samples, worn or self.worn, encoded)
         inputs = torch.cat([embedding, raw, features], 1)
         view = directions.spherical_harmonics(samples.direction)
         colour = torch.sigmoid(self.colour(inputs, view, samples.ray))

@@ -1,6 +1,7 @@
 """Two implementations of one interface: `reference` (plain torch, any device) and `cpu` (numba).
 
-Both folders hold the same file names (nearest, encoding, mlp, marching, optimiser) with the same
+Both folders hold the same file names (nearest, encoding, mlp, marching, picking,
+optimiser) with the same
 functions. Code that computes asks for one of them and never names it:
 
 >>> from pav_blender.core.kernels import select
@@ -14,7 +15,7 @@ import importlib
 from types import ModuleType
 from typing import Any
 
-MODULES = ("nearest", "encoding", "mlp", "marching", "optimiser")
+MODULES = ("nearest", "encoding", "mlp", "marching", "picking", "optimiser")
 
 
 def select(device: Any = "cpu", *, reference: bool = False) -> ModuleType:

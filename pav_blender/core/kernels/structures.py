@@ -58,3 +58,21 @@ class Wave(NamedTuple):
     barycentric: torch.Tensor  # [R,W,3]
     canonical: torch.Tensor  # [R,W,3] metres
     distance: torch.Tensor  # [R,W] metres, to the posed mesh
+
+
+class Picks(NamedTuple):
+    """Samples [R, W] of which the first `count` [R] of a ray count.
+
+    k: lattice index; steps: how many steps of the lattice the sample stands for; looks [R]:
+    places looked at; ended [R] bool: there was more to look at; the rest as in a `Wave`.
+    """
+
+    count: torch.Tensor  # type: ignore[assignment]
+    looks: torch.Tensor
+    ended: torch.Tensor
+    k: torch.Tensor
+    steps: torch.Tensor
+    triangle: torch.Tensor
+    barycentric: torch.Tensor
+    canonical: torch.Tensor
+    distance: torch.Tensor

@@ -9,7 +9,7 @@ import torch
 
 from ..deformation import Clearance
 from ..field.field import Samples
-from ..kernels.structures import Wave
+from ..kernels.structures import Picks, Wave
 from .cameras import Camera
 
 
@@ -54,14 +54,14 @@ class Packed:
         return len(self.ray)
 
 
-def pack(wave: Wave, jitter: torch.Tensor, step: float) -> Packed:
-    """Drops the empty slots of a wave."""
+def pack(wave: Wave | Picks, jitter: torch.Tensor, step: float) -> tuple[Packed, torch.Tensor]:
+    """The used slots of a wave or of picks, and which they are (flat)."""
     width = wave.k.shape[1]
     used = torch.arange(width)[None, :] < wave.count[:, None]
     slots = used.reshape(-1).nonzero()[:, 0]
     ray = torch.div(slots, width, rounding_mode="floor")
     t = (wave.k.reshape(-1)[slots].float() + jitter[ray]) * step
-    return Packed(
+    packed = Packed(
         ray.int(),
         t,
         wave.triangle.reshape(-1)[slots],
@@ -69,6 +69,7 @@ def pack(wave: Wave, jitter: torch.Tensor, step: float) -> Packed:
         wave.canonical.reshape(-1, 3)[slots],
         wave.distance.reshape(-1)[slots],
     )
+    return packed, slots
 
 
 def samples_of(

@@ -208,7 +208,7 @@ def _trace(scene: Scene, rays: RayBatch, settings: RenderSettings) -> tuple[np.n
             band=margin,
             leap_limit=0.004 if settings.skip else 0.0,
         )
-        packed = pack(wave, jitter[alive], settings.step)
+        packed, _ = pack(wave, jitter[alive], settings.step)
         if len(packed):
             samples = samples_of(
                 packed, scene.clearance, 0, scene.expression, part.directions, scene.rotation

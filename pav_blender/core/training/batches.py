@@ -9,17 +9,15 @@ import numpy as np
 import torch
 
 from .. import kernels
-from ..deformation import Clearance, Deformer, PosedMesh
+from ..deformation import Clearance, Deformer, PosedMesh, box, shell
 from ..deformation.rigid import head_rotation
-from ..field.field import Field, Samples
+from ..field.field import Samples
 from ..rendering.rays import Packed, RayBatch, camera_rays, pack
 from .frames import TILE, Frame
+from .occupancy import Visibility
 
 _UNIFORM = 0.05  # part of the tiles drawn from anywhere in the picture
 _KEPT_POSES = 512
-_WAVE = 16
-_ENDED = 1e-3  # transmittance at which a ray teaches nothing more
-_NEGLIGIBLE = 1e-4  # weight below which a sample has no gradient worth its time
 
 
 @dataclass(eq=False)
@@ -37,36 +35,50 @@ class Pixels:
 
 @dataclass(eq=False)
 class Picked:
-    """The samples kept for the backward pass, sorted by ray, and what the search saw.
-
-    cells [M] flat indices into the occupancy, seen [M] transmittance there, weights [M]: of all
-    samples that were looked at.
-    """
+    """The samples of a batch, sorted by ray: t [N], width [N] (metres of ray each stands for),
+    cells [N] (flat indices into the occupancy); looks: places that were looked at for them;
+    ended [R]: rays that were not followed to their end."""
 
     samples: Samples
     t: torch.Tensor
+    width: torch.Tensor
     cells: torch.Tensor
-    transmittance: torch.Tensor
-    weights: torch.Tensor
+    looks: int
+    ended: torch.Tensor
+
+
+@dataclass(eq=False)
+class _Posed:
+    mesh: PosedMesh
+    rotation: np.ndarray
+    shell: Clearance
+    version: int
 
 
 class Poses:
-    """Posed meshes and head rotations of frames, the most recently used ones kept."""
+    """Frames' posed meshes, head rotations and shells, the most recently used ones kept.
+
+    Cells are only ever emptied, so that an old shell is still right, merely wide.
+    """
 
     def __init__(self, deformer: Deformer, canonical: np.ndarray, weights: np.ndarray) -> None:
         self._deformer, self._canonical, self._weights = deformer, canonical, weights
-        self._kept: OrderedDict[str, tuple[PosedMesh, np.ndarray]] = OrderedDict()
+        self._kept: OrderedDict[str, _Posed] = OrderedDict()
 
-    def __call__(self, frame: Frame) -> tuple[PosedMesh, np.ndarray]:
-        if frame.name in self._kept:
-            self._kept.move_to_end(frame.name)
-            return self._kept[frame.name]
-        mesh = self._deformer.pose(frame.vertices)
-        rotation = head_rotation(self._canonical, frame.vertices, self._weights)
-        self._kept[frame.name] = mesh, rotation
-        if len(self._kept) > _KEPT_POSES:
-            self._kept.popitem(last=False)
-        return mesh, rotation
+    def __call__(self, frame: Frame, space: Clearance, version: int, reach: float) -> _Posed:
+        """The frame posed; its shell is that of `version` of the space, or a later one."""
+        known = self._kept.get(frame.name)
+        if known is None:
+            mesh = self._deformer.pose(frame.vertices)
+            rotation = head_rotation(self._canonical, frame.vertices, self._weights)
+            known = _Posed(mesh, rotation, shell(mesh, space, reach), version)
+            self._kept[frame.name] = known
+            if len(self._kept) > _KEPT_POSES:
+                self._kept.popitem(last=False)
+        elif known.version != version:
+            known.shell, known.version = shell(known.mesh, space, reach), version
+        self._kept.move_to_end(frame.name)
+        return known
 
 
 def draw_pixels(frames: list[Frame], rays: int, random: np.random.Generator) -> Pixels:
@@ -120,144 +132,65 @@ def _draw_tiles(
 
 
 def pick_samples(
-    field: Field,
     poses: Poses,
     pixels: Pixels,
-    spaces: list[Clearance],
+    visibility: Visibility,
     reach: float,
     step: float,
-    jitter: torch.Tensor,
+    generator: torch.Generator,
 ) -> Picked:
-    """Marches all rays in waves, without gradients, and keeps the samples that matter."""
+    """The samples of all rays, by what the field was of late; no network runs."""
     ops = kernels.select("cpu")
     count = len(pixels.rays)
     stops = [*pixels.starts[1:], count]
-    posed = [poses(frame) for frame in pixels.frames]
-    expression = torch.from_numpy(np.stack([f.expression for f in pixels.frames]))
-    appearance = torch.tensor([f.appearance for f in pixels.frames], dtype=torch.int32)
-    direction = torch.cat(
-        [
-            pixels.rays.directions[a:b] @ torch.from_numpy(rotation)
-            for a, b, (_, rotation) in zip(pixels.starts, stops, posed, strict=True)
-        ]
-    )
-    first = torch.zeros(count, dtype=torch.int32)
-    last = torch.full((count,), -1, dtype=torch.int32)
-    for a, b, (mesh, _) in zip(pixels.starts, stops, posed, strict=True):
-        part = pixels.rays.origins[a:b], pixels.rays.directions[a:b]
-        near, far = ops.marching.bounds(mesh.vertices, reach, *part)
-        first[a:b], last[a:b] = ops.marching.lattice(near, far, jitter[a:b], step)
-    left = torch.ones(count)
-    sums = torch.zeros(count, 3), torch.zeros(count), torch.zeros(count)
-    alive = last >= first
-    kept: list[tuple[torch.Tensor, ...]] = []
-    looked: list[tuple[torch.Tensor, ...]] = []
-    while bool(alive.any()):
-        packed, rows = _march_frames(
-            pixels, posed, spaces, stops, first, last, jitter, step, reach, alive
-        )
-        if len(packed):
-            frame = pixels.frame[packed.ray.long()]
-            samples = _samples(
-                packed, packed.ray, frame, appearance, expression, direction, spaces[0]
-            )
-            sigma = field.densities(samples)
-            before = left.clone()
-            weights = ops.marching.composite_step(
-                sigma, torch.zeros(len(packed), 3), packed.t, step, packed.ray, left, *sums
-            )
-            # at the sample itself, from the weight: T = w / alpha
-            alpha = -torch.expm1(-sigma * step)
-            seen = torch.where(
-                alpha > 1e-6, weights / alpha.clamp(min=1e-6), before[packed.ray.long()]
-            )
-            looked.append((_cells(samples, spaces[0]), seen, weights))
-            good = (weights > _NEGLIGIBLE).nonzero()[:, 0]
-            kept.append(
-                (
-                    packed.ray[good],
-                    packed.t[good],
-                    packed.triangle[good],
-                    packed.barycentric[good],
-                    packed.canonical[good],
-                    packed.distance[good],
-                )
-            )
-        alive[rows] = (first[rows] <= last[rows]) & (left[rows] > _ENDED)
-    if not kept:
-        none = torch.zeros(0, dtype=torch.int32)
-        kept = [(none, torch.zeros(0), none, *[torch.zeros(0, 3)] * 2, torch.zeros(0))]
-        looked = [(torch.zeros(0, dtype=torch.int64), torch.zeros(0), torch.zeros(0))]
-    joined = [torch.cat(column) for column in zip(*kept, strict=True)]
-    order = torch.argsort(joined[0], stable=True)
-    packed = Packed(*(column[order] for column in joined))
-    frame = pixels.frame[packed.ray.long()]
-    samples = _samples(packed, packed.ray, frame, appearance, expression, direction, spaces[0])
-    cells, seen, weights = (torch.cat(column) for column in zip(*looked, strict=True))
-    return Picked(samples, packed.t, cells, seen, weights)
-
-
-def _march_frames(
-    pixels: Pixels,
-    posed: list[tuple[PosedMesh, np.ndarray]],
-    spaces: list[Clearance],
-    stops: list[int],
-    first: torch.Tensor,
-    last: torch.Tensor,
-    jitter: torch.Tensor,
-    step: float,
-    reach: float,
-    alive: torch.Tensor,
-) -> tuple[Packed, torch.Tensor]:
-    """The next wave of every frame's living rays; `first` is moved on in place."""
-    ops = kernels.select("cpu")
-    parts, all_rows = [], []
+    jitter, chance = torch.rand(2, count, generator=generator)
+    parts: list[Packed] = []
+    steps, directions, frame, ended = [], [], [], []
+    looks = 0
     for index, (a, b) in enumerate(zip(pixels.starts, stops, strict=True)):
-        rows = alive[a:b].nonzero()[:, 0] + a
-        if len(rows) == 0:
-            continue
-        wave = ops.marching.march(
-            posed[index][0],
-            pixels.rays.origins[rows],
-            pixels.rays.directions[rows],
-            first[rows],
-            last[rows],
-            jitter[rows],
+        appearance = pixels.frames[index].appearance
+        space = visibility.spaces[appearance]
+        posed = poses(pixels.frames[index], space, visibility.version, reach)
+        rays = pixels.rays.origins[a:b], pixels.rays.directions[a:b]
+        near, far = ops.marching.bounds(box(posed.shell), 0.0, *rays)
+        picks = ops.picking.pick(
+            posed.mesh,
+            *rays,
+            *ops.marching.lattice(near, far, jitter[a:b], step),
+            jitter[a:b],
+            chance[a:b],
             step,
-            wave=_WAVE,
-            clearance=spaces[pixels.frames[index].appearance],
+            clearance=space,
+            guide=visibility.guide[appearance],
+            shell=posed.shell,
             band=reach,
         )
-        first[rows] = wave.next
-        packed = pack(wave, jitter[rows], step)
-        packed.ray = rows[packed.ray.long()].int()
+        looks += int(picks.looks.sum())
+        ended.append(picks.ended)
+        packed, slots = pack(picks, jitter[a:b], step)
+        packed.ray += a
         parts.append(packed)
-        all_rows.append(rows)
+        steps.append(picks.steps.view(-1)[slots])
+        frame.append(torch.full((len(packed),), index, dtype=torch.int32))
+        directions.append(rays[1] @ torch.from_numpy(posed.rotation))
     fields = ("ray", "t", "triangle", "barycentric", "canonical", "distance")
-    joined = Packed(*(torch.cat([getattr(p, name) for p in parts]) for name in fields))
-    return joined, torch.cat(all_rows)
-
-
-def _samples(
-    packed: Packed,
-    ray: torch.Tensor,
-    frame: torch.Tensor,
-    appearance: torch.Tensor,
-    expression: torch.Tensor,
-    direction: torch.Tensor,
-    space: Clearance,
-) -> Samples:
-    return Samples(
+    packed = Packed(*(torch.cat([getattr(p, name) for p in parts]) for name in fields))
+    appearances = torch.tensor([f.appearance for f in pixels.frames], dtype=torch.int32)
+    frames = torch.cat(frame)
+    space = visibility.spaces[0]
+    samples = Samples(
         canonical=(packed.canonical - space.box_min) * space.box_scale,
         triangle=packed.triangle,
         barycentric=packed.barycentric,
         distance=packed.distance,
-        appearance=appearance[frame.long()],
-        frame=frame,
-        ray=ray,
-        expression=expression,
-        direction=direction,
+        appearance=appearances[frames.long()],
+        frame=frames,
+        ray=packed.ray,
+        expression=torch.from_numpy(np.stack([f.expression for f in pixels.frames])),
+        direction=torch.cat(directions),
     )
+    width, cells = torch.cat(steps) * step, _cells(samples, space)
+    return Picked(samples, packed.t, width, cells, looks, torch.cat(ended))
 
 
 def _cells(samples: Samples, space: Clearance) -> torch.Tensor:

@@ -26,8 +26,10 @@ def losses(
     colour: torch.Tensor,
     opacity: torch.Tensor,
     depth: torch.Tensor,
+    counted: torch.Tensor,
 ) -> Loss:
-    """Predicted premultiplied colour [R, 3], opacity [R], ray termination [R] (sum of w t).
+    """Predicted premultiplied colour [R, 3], opacity [R], ray termination [R] (sum of w t);
+    counted [R] bool: the rays that take part.
 
     Prediction and target stand before the same random background [R, 3], so that the mattes
     teach where the avatar ends.
@@ -35,8 +37,8 @@ def losses(
     alpha = pixels.alpha[:, None]
     target = pixels.colour * alpha + background * (1 - alpha)
     shown = colour + background * (1 - opacity[:, None])
-    mse = (shown - target).square().mean()
-    face = pixels.depth > 0
+    mse = torch.where(counted[:, None], (shown - target).square(), 0.0).mean()
+    face = (pixels.depth > 0) & counted
     gap = torch.where(face, (depth * pixels.rays.cosine - pixels.depth).abs(), 0.0).mean()
     total = config.colour_weight * mse + config.depth_weight * gap
     return Loss(total, float(mse.detach()), float(gap.detach()))

@@ -11,9 +11,12 @@ import numpy as np
 import torch
 from scipy import ndimage
 
-from ..deformation import Clearance
+from .. import kernels
+from ..deformation import Clearance, Deformer
+from ..field.avatar import Avatar
 from ..rendering.render import clearance_of
 
+_MUCH = 0.8  # part of the space that is left when shells are worth making anew
 _SEEN = 0.1  # transmittance from which a look at a cell counts
 _LOOKS = 8.0  # looks after which a cell is judged
 _BLOCK_LOOKS = 16.0  # the same for eight cells together
@@ -21,14 +24,32 @@ _LEAST_WEIGHT = 2e-3  # a millimetre; untrained fog has about twice that
 _HIDDEN = 12  # rounds without a look after which a cell counts as hidden
 
 
+def first_guide(avatar: Avatar, deformer: Deformer) -> torch.Tensor:
+    """The density [A, G, G, G] (1/m) of an untrained field in each cell."""
+    size = avatar.occupied.shape[1]
+    side = avatar.box_size / size
+    centres = torch.cartesian_prod(*[(torch.arange(size) + 0.5) * side] * 3)
+    centres += torch.from_numpy(np.asarray(avatar.box_min, np.float32))
+    distance = deformer.nearest(deformer.pose(avatar.canonical_vertices), centres)[2]
+    density = torch.exp(avatar.field.untrained(distance)) * 1e3
+    return density.view(1, size, size, size).repeat(len(avatar.occupied), 1, 1, 1)
+
+
 class Visibility:
     """What was seen of each cell since it was last judged, over all appearances.
 
     occupied [A, G, G, G] bool is changed in place; near [G, G, G] bool: close to the mesh.
+    guide [A, G, G, G] float32: the density (1/m) that the field had of late in each cell.
+    version counts how often much was emptied.
     """
 
     def __init__(
-        self, occupied: np.ndarray, near: np.ndarray, box_min: np.ndarray, box_size: float
+        self,
+        occupied: np.ndarray,
+        near: np.ndarray,
+        guide: torch.Tensor,
+        box_min: np.ndarray,
+        box_size: float,
     ) -> None:
         self.occupied = occupied
         self._near = near
@@ -37,10 +58,17 @@ class Visibility:
         self.looks = torch.zeros(occupied.size)
         self.filled = torch.ones(occupied.size, dtype=torch.bool)
         self.unseen = torch.zeros(occupied.size, dtype=torch.uint8)
+        self.guide = guide
         self.spaces: list[Clearance] = []
+        self.version = 0
+        self._marked = 1.0
         self._refresh()
 
     def _refresh(self) -> None:
+        filled = float(self.occupied.mean())
+        if filled < _MUCH * self._marked:
+            self._marked = filled
+            self.version += 1
         self.spaces = [clearance_of(cells, *self._box) for cells in self.occupied]
 
     def state(self) -> dict[str, torch.Tensor]:
@@ -51,6 +79,7 @@ class Visibility:
             "looks": self.looks,
             "filled": self.filled,
             "unseen": self.unseen,
+            "guide": self.guide,
         }
 
     def restore(self, state: dict[str, torch.Tensor]) -> None:
@@ -59,8 +88,16 @@ class Visibility:
             tensor.copy_(state[name])
         self._refresh()
 
-    def watch(self, cells: torch.Tensor, seen: torch.Tensor, weights: torch.Tensor) -> None:
-        """Takes in the samples of a batch: cell [M], transmittance [M], weight a millimetre [M]."""
+    def watch(
+        self, cells: torch.Tensor, density: torch.Tensor, weights: torch.Tensor, width: torch.Tensor
+    ) -> None:
+        """Takes in the samples of a batch: cell [N], density [N] (1/m), weight [N] in the pixel,
+        and how far along the ray each reaches [N], metres."""
+        kernels.select("cpu").picking.follow(self.guide, cells, density)
+        # at the sample itself, from the weight: T = w / alpha
+        alpha = -torch.expm1(-density * width)
+        seen = torch.where(alpha > 1e-6, weights / alpha.clamp(min=1e-6), 1.0)
+        weights = weights / (1e3 * width)
         self.weight.scatter_reduce_(0, cells, weights, "amax")
         looked = cells[seen > _SEEN]
         self.looks.index_add_(0, looked, torch.ones(len(looked)))

@@ -17,16 +17,17 @@ from .batches import Poses, draw_pixels, pick_samples
 from .carving import close_to
 from .frames import Frame
 from .losses import Loss, losses
-from .occupancy import Visibility
+from .occupancy import Visibility, first_guide
 
 _FIRST_STEP = 8.0  # the first samples are this many times as far apart as the last
 _LOOKS_A_RAY = 24  # the step is as fine as this many looks a ray allow
-_LOOKS = 1 << 15  # looks a batch in fog: many small steps find the head sooner
+_SAMPLES = 1 << 15  # samples a batch, by the number of its rays
 _CARVED = 0.5  # part of the schedule in which space is emptied often
 _PRUNE_EVERY = 40  # iterations, while there is much to empty
 _PRUNE_LATER = 200
 _UNSEEN_REACH = 0.015  # metres from the mesh within which cells that no ray saw are kept
 _WARM_UP = 20
+_ENDED = 0.01  # transmittance at which a ray may be ended
 _PRUNE_FROM = 0.15
 
 
@@ -66,8 +67,9 @@ class Trainer:
             self.config.occupancy_resolution,
             _UNSEEN_REACH,
         )
-        self.visibility = Visibility(avatar.occupied, near, *box)
         deformer = Deformer(avatar.canonical_vertices, avatar.triangles, self.config.frames)
+        guide = first_guide(avatar, deformer)
+        self.visibility = Visibility(avatar.occupied, near, guide, *box)
         self._poses = Poses(deformer, avatar.canonical_vertices, avatar.rigid_weights)
         self._by_appearance = [
             [f for f in frames if f.appearance == a] for a in range(len(avatar.appearances))
@@ -76,8 +78,8 @@ class Trainer:
             name: (torch.zeros_like(p), torch.zeros_like(p))
             for name, p in avatar.field.named_parameters()
         }
-        for parameter in avatar.field.parameters():
-            parameter.grad = torch.zeros_like(parameter)
+        # the tables' gradient never lies anywhere as a whole: see `encode_adam_step`
+        avatar.field.tables.requires_grad_(False)
         self._mse = math.nan
 
     @property
@@ -90,38 +92,33 @@ class Trainer:
     def iterate(self) -> Status:
         """One iteration: batch, loss, backward, Adam; the occupancy now and then."""
         started = time.monotonic()
-        config, status = self.config, self.status
+        config, status, field = self.config, self.status, self.avatar.field
         pixels = draw_pixels(self._choose_frames(), status.rays, self.random)
         count = len(pixels.rays)
-        step = status.step
-        jitter = torch.rand(count, generator=self.generator)
         with torch.no_grad():
             picked = pick_samples(
-                self.avatar.field,
-                self._poses,
-                pixels,
-                self.visibility.spaces,
-                config.reach,
-                step,
-                jitter,
+                self._poses, pixels, self.visibility, config.reach, status.step, self.generator
             )
-            per_millimetre = picked.weights / (1e3 * step)
-            self.visibility.watch(picked.cells, picked.transmittance, per_millimetre)
+            encoded = field.encode(picked.samples)
         ops = kernels.select("cpu")
-        sigma, rgb = self.avatar.field(picked.samples)
-        colour, opacity, depth, _ = ops.marching.composite(
-            sigma, rgb, picked.t, step, picked.samples.ray, count
+        sigma, rgb = field(picked.samples, encoded=encoded.requires_grad_())
+        colour, opacity, depth, weights = ops.marching.composite(
+            sigma, rgb, picked.t, picked.width, picked.samples.ray, count
         )
         background = torch.rand(count, 3, generator=self.generator)
-        loss = losses(config, pixels, background, colour, opacity, depth)
+        # what lies behind where a ray was ended by mistake must not be laid to what is before it
+        counted = ~picked.ended | (opacity.detach() > 1 - _ENDED)
+        loss = losses(config, pixels, background, colour, opacity, depth, counted)
+        self.uncounted = 1 - float(counted.float().mean())
         if torch.isfinite(loss.total):
             loss.total.backward()
-            self._adam()
+            self._adam(picked.samples.canonical, encoded)
+        self.visibility.watch(picked.cells, sigma.detach(), weights.detach(), picked.width)
         status.iteration += 1
         if self._prunes_now():
             status.filled = self.visibility.prune()
         self._note(loss, len(picked.t) / max(count, 1))
-        self._plan(len(picked.cells), count)
+        self._plan(picked.looks / max(count, 1))
         status.seconds += time.monotonic() - started
         return status
 
@@ -136,44 +133,49 @@ class Trainer:
             )
         ]
 
-    def _plan(self, looks: int, rays: int) -> None:
-        """Sets the next batch's step and size from what the last one looked at.
+    def _plan(self, looks: float) -> None:
+        """Sets the next batch's step and size from what the last one looked at, a ray.
 
         While nothing is known of where the head ends, a ray passes much fog: few rays of few
         samples find out as well, and far sooner.
         """
         status, config = self.status, self.config
-        a_ray = looks / max(rays, 1)
-        wanted = status.step / config.step * (max(a_ray, 1.0) / _LOOKS_A_RAY) ** 0.2
+        wanted = status.step / config.step * (max(looks, 1.0) / _LOOKS_A_RAY) ** 0.2
         status.step = config.step * min(max(wanted, 1.0), _FIRST_STEP)
-        status.rays = int(min(max(_LOOKS / max(a_ray, 1.0), config.rays / 8), config.rays))
+        rays = _SAMPLES / max(status.samples_per_ray, 1.0)
+        status.rays = int(min(max(rays, config.rays / 8), config.rays))
 
     def _prunes_now(self) -> bool:
         often = self.done < _CARVED
         every = _PRUNE_EVERY if often else _PRUNE_LATER
         return self.done > _PRUNE_FROM and self.status.iteration % every == 0
 
-    def _adam(self) -> None:
-        config = self.config
+    def _adam(self, points: torch.Tensor, encoded: torch.Tensor) -> None:
+        config, field = self.config, self.avatar.field
         ops = kernels.select("cpu")
         step = self.status.iteration + 1
         late = max(0.0, self.done - config.decay_from) / (1 - config.decay_from)
         decay = config.final_learning_rate**late * min(1.0, step / _WARM_UP)
-        for name, parameter in self.avatar.field.named_parameters():
-            base = {
-                "offset": config.offset_learning_rate,
-                "tables": config.table_learning_rate,
-                "latent": config.latent_learning_rate,
-                "code": config.latent_learning_rate,
-            }.get(name.partition(".")[0], config.learning_rate)
+        rates = {
+            "offset": config.offset_learning_rate,
+            "tables": config.table_learning_rate,
+            "latent": config.latent_learning_rate,
+            "code": config.latent_learning_rate,
+        }
+        for name, parameter in field.named_parameters():
             m, v = self.moments[name]
             settings = {
                 "step": step,
-                "lr": base * decay,
+                "lr": rates.get(name.partition(".")[0], config.learning_rate) * decay,
                 "beta1": config.beta1,
                 "beta2": config.beta2,
                 "eps": config.epsilon,
             }
+            if name == "tables":
+                if encoded.grad is not None:
+                    state = parameter.data, m, v, field.layout
+                    ops.encoding.encode_adam_step(points, encoded.grad, *state, **settings)
+                continue
             grad = parameter.grad
             if grad is None or parameter.numel() == 0:
                 continue

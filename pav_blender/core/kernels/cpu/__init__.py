@@ -31,9 +31,9 @@ def _cache_root() -> Path:
 
 
 def _fingerprint() -> str:
-    """Hash of the sources here: numba looks at one file's date only and misses edits of imports."""
+    """Hash of the kernels' sources: numba looks at one file's date only and misses edits of imports."""
     digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.glob("*.py")):
+    for path in sorted(Path(__file__).parents[1].rglob("*.py")):
         digest.update(path.name.encode())
         digest.update(path.read_bytes())
     return digest.hexdigest()[:12]

@@ -82,20 +82,60 @@ def _canonical(triangle_maps, vertex_maps, vertices, corners, triangle, wa, wb, 
 
 
 @njit(**INLINE)
+def _cell(size, corner, scale, x, y, z):
+    """Flat index of the cell that canonical (x, y, z), a place inside the box, lies in."""
+    fx, fy, fz = (x - corner[0]) * scale, (y - corner[1]) * scale, (z - corner[2]) * scale
+    return (int(fx) * size + int(fy)) * size + int(fz)
+
+
+@njit(**INLINE)
 def _clear_cells(grid, size, corner, scale, x, y, z):
     """Cells to the nearest occupied one from canonical (x, y, z): 0 inside an occupied cell."""
     fx, fy, fz = (x - corner[0]) * scale, (y - corner[1]) * scale, (z - corner[2]) * scale
     outside = max(max(-fx, -fy, -fz), max(fx, fy, fz) - np.float32(size))
     within = min(fx, fy, fz) >= 0 and max(fx, fy, fz) < size
     if within:
-        return int(grid[(int(fx) * size + int(fy)) * size + int(fz)])
+        return int(grid[_cell(size, corner, scale, x, y, z)])
     if outside > 0:
         return 1 + int(min(outside, np.float32(254.0)))
     return 1  # on the far face, or not a number
 
 
+@njit(**INLINE)
+def _next_filled(shell, size, corner, scale, rays, i, k, last, step):
+    """The first lattice index from k on at which lane i's ray may be near anything."""
+    jitter = rays[6 * LANES + i]
+    while k <= last:
+        t = (np.float32(k) + jitter) * step
+        leave = np.float32(np.inf)
+        inside = True
+        clear = 0
+        at = 0
+        for axis in range(3):
+            d = rays[(axis + 3) * LANES + i]
+            f = (rays[axis * LANES + i] + t * d - corner[axis]) * scale
+            if not (f >= 0 and f < size):
+                inside = False
+            else:
+                at = at * size + int(f)
+        if not inside:  # rays are followed within the shell's box: this is rounding
+            return k
+        clear = int(shell[at])
+        if clear == 0:
+            return k
+        for axis in range(3):
+            d = rays[(axis + 3) * LANES + i] * scale
+            if d == 0:
+                continue
+            f = (rays[axis * LANES + i] - corner[axis]) * scale + t * d
+            wall = np.float32(int(f) + clear if d > 0 else int(f) + 1 - clear)
+            leave = min(leave, (wall - f) / d)
+        k += max(np.int32(min(leave / step, np.float32(last - k))), np.int32(0)) + np.int32(1)
+    return k
+
+
 @njit(**OPTIONS)
-def _march(
+def march_rays(
     start,
     stop,
     arrays,
@@ -113,9 +153,16 @@ def _march(
     size,
     corner,
     scale,
+    shell,
+    shell_size,
+    shell_corner,
+    shell_scale,
     band,
     leap_limit,
+    guide,
+    opaque,
     wave,
+    out_density,
     out_count,
     out_next,
     out_k,
@@ -124,6 +171,11 @@ def _march(
     out_canonical,
     out_distance,
 ):
+    """Samples of rays start to stop into the slots of a wave; `march` says which.
+
+    With a guide [G^3], densities (1/m) of the cells, a ray ends where it has passed `opaque`
+    optical depths of it.
+    """
     boxes, starts, records = arrays[0], arrays[1], arrays[2]
     stack = np.empty(STACK, np.int32)
     scratch = np.empty(LANES, np.float32)
@@ -135,6 +187,8 @@ def _march(
     triangle = np.empty(LANES, np.int32)
     ks = np.empty(LANES, np.int32)
     active = np.empty(LANES, np.int32)
+    passed = np.zeros(LANES, np.float32)
+    guided = len(guide) > 0
     steps = splat(step)
     cell = np.float32(1.0) / scale
     for base in range(start, stop, LANES):
@@ -147,12 +201,26 @@ def _march(
                 feet[axis * LANES + i] = np.inf
             rays[6 * LANES + i] = jitter[ray]
             ks[i] = first[ray]
+            passed[i] = 0
             active[i] = 1 if base + i < stop and first[ray] <= last[ray] else 0
             alive += active[i]
             if base + i < stop:
                 out_count[ray] = 0
                 out_next[ray] = max(first[ray], last[ray] + 1)
         while alive > 0:
+            if shell_size > 0:
+                for i in range(LANES):
+                    if active[i] == 0:
+                        continue
+                    end = last[base + i]
+                    ks[i] = _next_filled(
+                        shell, shell_size, shell_corner, shell_scale, rays, i, ks[i], end, step
+                    )
+                    if ks[i] > end:
+                        active[i] = 0
+                        alive -= 1
+                if alive == 0:
+                    break
             going = splat_int(0) < load(active, 0)
             t = (to_float(load(ks, 0)) + load(rays, 6 * LANES)) * steps
             px = fma(t, load(rays, 3 * LANES), load(rays, 0))
@@ -227,7 +295,18 @@ def _march(
                             out_barycentric[ray, slot, axis] = barycentric[axis * LANES + i]
                             out_canonical[ray, slot, axis] = canonical[axis * LANES + i]
                         out_count[ray] = slot + 1
-                        if slot + 1 == wave:
+                        if guided:
+                            at = _cell(
+                                size,
+                                corner,
+                                scale,
+                                canonical[i],
+                                canonical[LANES + i],
+                                canonical[2 * LANES + i],
+                            )
+                            out_density[ray, slot] = guide[at]
+                            passed[i] += guide[at] * step
+                        if slot + 1 == wave or passed[i] > opaque:
                             out_next[ray] = k + 1
                             active[i] = 0
                             alive -= 1
@@ -239,6 +318,8 @@ def _march(
                 if k + leap > last[ray]:
                     active[i] = 0
                     alive -= 1
+    if guided:  # whoever picks from the slots goes by their count
+        return
     for ray in range(start, stop):
         for slot in range(out_count[ray], wave):
             out_k[ray, slot] = -1
@@ -250,16 +331,26 @@ def _march(
 
 
 _NOTHING = np.empty(0, np.float32)
+_NO_ROWS = np.empty((0, 0), np.float32)
 
 
-def _flat(values: torch.Tensor | None) -> np.ndarray:
+def flat(values: torch.Tensor | None) -> np.ndarray:
     if values is None:
         return _NOTHING
     return np.ascontiguousarray(values.detach().numpy(), np.float32).reshape(-1)
 
 
-def _rows(values: torch.Tensor, kind: type) -> np.ndarray:
+def rows_of(values: torch.Tensor, kind: type) -> np.ndarray:
     return np.ascontiguousarray(values.detach().numpy(), kind)
+
+
+def grid_of(clearance: Clearance | None) -> tuple[np.ndarray, int, np.ndarray, np.float32]:
+    """Flat cells, cells a side (0: no grid), lowest corner, cells a metre."""
+    if clearance is None:
+        return np.empty(0, np.uint8), 0, np.zeros(3, np.float32), np.float32(1)
+    size = clearance.grid.shape[0]
+    grid = np.ascontiguousarray(clearance.grid.numpy(), np.uint8).reshape(-1)
+    return grid, size, flat(clearance.box_min), np.float32(clearance.box_scale * size)
 
 
 def march(
@@ -273,6 +364,7 @@ def march(
     *,
     wave: int,
     clearance: Clearance | None = None,
+    shell: Clearance | None = None,
     band: float = np.inf,
     leap_limit: float = 0.004,
 ) -> Wave:
@@ -282,14 +374,9 @@ def march(
     its canonical cell is occupied. Outside the band a ray leaps by what certainly stays outside; in
     empty cells by 0.7 of the clear distance, at most `leap_limit` metres, which can pass over an
     occupied cell only where the map to canonical space stretches more or jumps (between lips).
+    With a `shell` (`deformation.shell`) a ray leaps over the posed space that it says is clear.
     """
     count = len(origins)
-    grid, size, corner, scale = np.empty(0, np.uint8), 0, np.zeros(3, np.float32), 1.0
-    if clearance is not None:
-        size = clearance.grid.shape[0]
-        grid = np.ascontiguousarray(clearance.grid.numpy(), np.uint8).reshape(-1)
-        corner = _flat(clearance.box_min)
-        scale = clearance.box_scale * size
     result = Wave(
         torch.empty(count, dtype=torch.int32),
         torch.empty(count, dtype=torch.int32),
@@ -300,27 +387,28 @@ def march(
         torch.empty((count, wave)),
     )
     run_chunks(
-        _march,
+        march_rays,
         count,
         _CHUNK,
         mesh.search.arrays,
-        _flat(mesh.triangle_maps),
-        _flat(mesh.vertex_maps),
-        _flat(mesh.vertices),
+        flat(mesh.triangle_maps),
+        flat(mesh.vertex_maps),
+        flat(mesh.vertices),
         mesh.search.topology.corners.reshape(-1),
-        _rows(origins, np.float32),
-        _rows(directions, np.float32),
-        _rows(first, np.int32),
-        _rows(last, np.int32),
-        _rows(jitter, np.float32),
+        rows_of(origins, np.float32),
+        rows_of(directions, np.float32),
+        rows_of(first, np.int32),
+        rows_of(last, np.int32),
+        rows_of(jitter, np.float32),
         np.float32(step),
-        grid,
-        size,
-        corner,
-        np.float32(scale),
+        *grid_of(clearance),
+        *grid_of(shell),
         np.float32(band),
         np.float32(leap_limit),
+        _NOTHING,
+        np.float32(np.inf),
         wave,
+        _NO_ROWS,
         *(values.numpy() for values in result),
     )
     return result
@@ -377,12 +465,12 @@ def canonicalise(
         _canonicalise,
         len(points),
         8192,
-        _rows(points, np.float32),
-        _rows(triangle, np.int32),
-        _rows(barycentric, np.float32),
-        _flat(mesh.triangle_maps),
-        _flat(mesh.vertex_maps),
-        _flat(mesh.vertices),
+        rows_of(points, np.float32),
+        rows_of(triangle, np.int32),
+        rows_of(barycentric, np.float32),
+        flat(mesh.triangle_maps),
+        flat(mesh.vertex_maps),
+        flat(mesh.vertices),
         mesh.search.topology.corners.reshape(-1),
         out.numpy(),
     )
