@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +30,29 @@ class Frame:
     expression: np.ndarray
     appearance: int
     name: str
+
+
+def halved(frame: Frame) -> Frame:
+    """The frame at half its size, every pixel the mean of four; an odd last row or column goes."""
+    height, width = (size // 2 for size in frame.rgba.shape[:2])
+    if min(height, width) < 1:
+        return frame
+    shape = (height, 2, width, 2, -1)
+    rgba = frame.rgba[: 2 * height, : 2 * width].astype(np.float32).reshape(shape)
+    alpha = rgba[..., 3:].sum((1, 3))
+    colour = (rgba[..., :3] * rgba[..., 3:]).sum((1, 3)) / np.maximum(alpha, 1e-6)
+    mean = np.concatenate([colour, alpha / 4], -1)
+    depth = frame.depth[: 2 * height, : 2 * width].astype(np.float32).reshape(shape)
+    known = (depth > 0).all((1, 3))
+    small = np.where(known, depth.mean((1, 3)), 0)[..., 0].astype(np.float16)
+    rgba8 = (mean + 0.5).astype(np.uint8)
+    return dataclasses.replace(
+        frame,
+        rgba=rgba8,
+        depth=small,
+        tiles=_tiles(rgba8[..., 3]),
+        camera=frame.camera.window(0, 0, 2 * width, 2 * height).resized(width, height),
+    )
 
 
 def camera_of(clip: Clip, row: int) -> Camera:

@@ -15,7 +15,7 @@ from ..deformation import Deformer
 from ..field.avatar import Avatar
 from .batches import Poses, draw_pixels, pick_samples
 from .carving import close_to
-from .frames import Frame
+from .frames import Frame, halved
 from .losses import Loss, losses
 from .occupancy import Visibility, first_guide
 
@@ -27,6 +27,9 @@ _PRUNE_EVERY = 40  # iterations, while there is much to empty
 _PRUNE_LATER = 200
 _UNSEEN_REACH = 0.015  # metres from the mesh within which cells that no ray saw are kept
 _WARM_UP = 20
+# parts of the schedule until which pictures are a half and a quarter as large: there are more
+# pixels than an avatar's minutes have rays, and small ones tell the most each
+_COARSE = (0.4, 0.15)
 _ENDED = 0.01  # transmittance at which a ray may be ended
 _PRUNE_FROM = 0.15
 
@@ -71,9 +74,10 @@ class Trainer:
         guide = first_guide(avatar, deformer)
         self.visibility = Visibility(avatar.occupied, near, guide, *box)
         self._poses = Poses(deformer, avatar.canonical_vertices, avatar.rigid_weights)
-        self._by_appearance = [
-            [f for f in frames if f.appearance == a] for a in range(len(avatar.appearances))
-        ]
+        self._pyramid = [_by_appearance(frames, len(avatar.appearances))]
+        for _ in _COARSE:
+            frames = [halved(frame) for frame in frames]
+            self._pyramid.append(_by_appearance(frames, len(avatar.appearances)))
         self.moments = {
             name: (torch.zeros_like(p), torch.zeros_like(p))
             for name, p in avatar.field.named_parameters()
@@ -123,8 +127,8 @@ class Trainer:
         return status
 
     def _choose_frames(self) -> list[Frame]:
-        """Frames of a batch: appearances in turn, frames at random."""
-        groups = [group for group in self._by_appearance if group]
+        """Frames of a batch: appearances in turn, frames at random; small pictures come first."""
+        groups = self._pyramid[sum(self.done < until for until in _COARSE)]
         offset = int(self.random.integers(len(groups)))
         return [
             group[self.random.integers(len(group))]
@@ -194,3 +198,8 @@ class Trainer:
         status.loss = keep * status.loss + (1 - keep) * float(loss.total.detach())
         status.samples_per_ray = keep * status.samples_per_ray + (1 - keep) * samples
         status.psnr = -10 * math.log10(max(self._mse, 1e-10))
+
+
+def _by_appearance(frames: list[Frame], appearances: int) -> list[list[Frame]]:
+    groups = ([f for f in frames if f.appearance == a] for a in range(appearances))
+    return [group for group in groups if group]

@@ -31,7 +31,7 @@ def _cache_root() -> Path:
 
 
 def _fingerprint() -> str:
-    """Hash of the kernels' sources: numba looks at one file's date only and misses edits of imports."""
+    """Hash of the kernels' sources: numba looks at one file's date and misses edits of imports."""
     digest = hashlib.sha256()
     for path in sorted(Path(__file__).parents[1].rglob("*.py")):
         digest.update(path.name.encode())
