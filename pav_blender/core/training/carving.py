@@ -18,10 +18,10 @@ from ..deformation import Deformer, triangle_maps
 from ..rendering.rasterise import rasterise
 from .frames import Frame
 
-_MISSES = 0.12  # part of the pictures that may disagree: mattes and tracks are not exact
+_MISSES = 0.3  # part of the pictures that may disagree: mattes and tracks are not exact
 _INSIDE = 0.010  # metres below the skin where nothing is ever seen
 _REACH = {  # metres; regions that are not named may be covered by long hair
-    "torso": 0.05,
+    "torso": 0.08,
     "face": 0.035,
     "lips": 0.03,
     "left_eye_region": 0.035,
