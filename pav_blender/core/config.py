@@ -17,10 +17,10 @@ class Config:
     """Defaults are what measured best here; `Config.paper()` is the paper's own."""
 
     # multi-resolution hash encoding of the canonical point (Instant-NGP; paper, Implementation)
-    levels: int = 16
+    levels: int = 12
     log2_entries: int = 18
     base_resolution: int = 16
-    finest_resolution: int = 2048
+    finest_resolution: int = 512
 
     # appearance embedding (paper, Learned Appearance Embedding)
     appearance: Literal["vertex", "surface", "global", "none"] = "vertex"
@@ -32,10 +32,13 @@ class Config:
     # networks (paper, Appearance Conditioned NeRF)
     hidden: int = 64
     geometry_channels: int = 16  # the first is the log-density
-    density_layers: int = 2
+    density_layers: int = 1
     offset_layers: int = 1
-    colour_layers: int = 2
+    colour_layers: int = 1
     density_offset: bool = True
+    # the density sees how the head is turned besides the expression: collars and long hair do
+    # not move with the skin they are nearest to
+    sees_turn: bool = True
     # the paper's offset sees the embedding and the expression; seeing the point's geometry
     # features too lets one appearance fill space that another leaves empty
     offset_sees_geometry: bool = True
@@ -88,11 +91,16 @@ class Config:
     def paper(cls) -> Config:
         """The settings of the paper; where it is silent, INSTA's (reference in docs)."""
         return cls(
+            levels=16,
+            finest_resolution=2048,
+            density_layers=2,
+            colour_layers=2,
             frames="rigid",
             appearance_code=False,
             start_on_mesh=False,
             density_bias=-4.5,
             offset_sees_geometry=False,
+            sees_turn=False,
             learning_rate=2.5e-3,
             offset_learning_rate=2.5e-4,
             table_learning_rate=2.5e-3,

@@ -135,7 +135,7 @@ def _write(
     height, width, channels = pixels.shape
     spec = oiio.ImageSpec(width, height, channels, kind)
     spec.attribute("oiio:UnassociatedAlpha", 1)
-    spec.attribute("png:compressionLevel", 9)
+    spec.attribute("png:compressionLevel", 4)
     _save(path, spec, pixels, metadata)
 
 

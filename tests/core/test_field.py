@@ -39,7 +39,7 @@ def make_samples(count=40, seed=0):
         appearance=torch.randint(0, 3, (count,), generator=g, dtype=torch.int32),
         frame=torch.randint(0, 2, (count,), generator=g, dtype=torch.int32),
         ray=torch.arange(count, dtype=torch.int32),
-        expression=torch.rand(2, 5, generator=g),
+        condition=torch.rand(2, 8, generator=g),
         direction=direction,
     )
 
@@ -110,9 +110,9 @@ def test_expression_and_direction_enter_as_the_first_layers_inputs():
     samples = make_samples()
     with torch.no_grad():
         encoded = torch.rand(40, field.layout.width)
-        folded = field.density(encoded, samples.expression, samples.frame)
+        folded = field.density(encoded, samples.condition, samples.frame)
         weight = torch.cat([field.density.weights[0], field.density.group_weight], 1)
-        inputs = torch.cat([encoded, samples.expression[samples.frame.long()]], 1)
+        inputs = torch.cat([encoded, samples.condition[samples.frame.long()]], 1)
         plain = torch.relu(inputs @ weight.T + field.density.biases[0])
         for w, b in list(zip(field.density.weights, field.density.biases, strict=True))[1:-1]:
             plain = torch.relu(plain @ w.T + b)
@@ -123,7 +123,7 @@ def test_expression_and_direction_enter_as_the_first_layers_inputs():
 def test_density_alone_is_the_density_of_the_whole():
     field = make_field()
     with torch.no_grad():
-        assert torch.equal(field.densities(make_samples()), field(make_samples())[0])
+        assert torch.equal(field.geometry(make_samples())[0], field(make_samples())[0])
 
 
 def test_extreme_weights_stay_finite():

@@ -55,8 +55,10 @@ def rays(count: int = 48, seed: int = 0):
     spread = torch.rand((count, 2), generator=generator) * 0.3 - 0.15
     directions = torch.cat([spread, -torch.full((count, 1), 0.5)], 1)
     origins = torch.tensor([0.0, 0.0, 0.5]).expand(count, 3).contiguous()
-    return origins, torch.nn.functional.normalize(directions, dim=1), torch.rand(
-        count, generator=generator
+    return (
+        origins,
+        torch.nn.functional.normalize(directions, dim=1),
+        torch.rand(count, generator=generator),
     )
 
 
@@ -72,9 +74,7 @@ def run(kernels, mesh, wave=80, margin=0.03, step=STEP, count=48, **options):
     origins, directions, jitter = rays(count)
     near, far = kernels.bounds(mesh.vertices, margin, origins, directions)
     first, last = kernels.lattice(near, far, jitter, step)
-    return kernels.march(
-        mesh, origins, directions, first, last, jitter, step, wave=wave, **options
-    )
+    return kernels.march(mesh, origins, directions, first, last, jitter, step, wave=wave, **options)
 
 
 def emitted(wave) -> set[tuple[int, int]]:

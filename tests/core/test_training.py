@@ -17,6 +17,7 @@ from pav_blender.core.field.avatar import Avatar
 from pav_blender.core.rendering.render import RenderSettings
 from pav_blender.core.training.batches import draw_pixels
 from pav_blender.core.training.checkpoint import checkpoint_path
+from pav_blender.core.training.frames import halved
 from pav_blender.core.training.losses import losses
 from pav_blender.core.training.prepare import load_training_frames, new_avatar
 from pav_blender.core.training.train import train
@@ -80,15 +81,35 @@ def test_the_loss_is_zero_for_the_truth_and_weighs_as_the_paper_says(frames, sma
     background = torch.rand(len(alpha), 3)
     distance = pixels.depth / pixels.rays.cosine
     truth = (pixels.colour * alpha, pixels.alpha, distance)
-    assert float(losses(small_config, pixels, background, *truth).total) == pytest.approx(
+    every = torch.ones(len(alpha), dtype=torch.bool)
+    assert float(losses(small_config, pixels, background, *truth, every).total) == pytest.approx(
         0, abs=1e-6
     )
-    off = losses(small_config, pixels, background, truth[0] + 0.1, *truth[1:])
+    off = losses(small_config, pixels, background, truth[0] + 0.1, *truth[1:], every)
     assert float(off.total) == pytest.approx(50 * 0.01, rel=1e-3)
-    far = losses(small_config, pixels, background, *truth[:2], distance + 0.1 / pixels.rays.cosine)
+    away = distance + 0.1 / pixels.rays.cosine
+    far = losses(small_config, pixels, background, *truth[:2], away, every)
     face = float((pixels.depth > 0).float().mean())
     assert face > 0.05
     assert float(far.total) == pytest.approx(10 * 0.1 * face, rel=1e-3)
+    none = losses(small_config, pixels, background, truth[0] + 0.1, *truth[1:], ~every)
+    assert float(none.total) == 0
+
+
+def test_a_halved_frame_is_the_mean_of_its_pixels_under_the_same_camera(frames):
+    frame = next(f for f in frames if 0 < f.rgba[..., 3].mean() < 255)
+    small = halved(frame)
+    height, width = small.rgba.shape[:2]
+    assert (height, width) == tuple(size // 2 for size in frame.rgba.shape[:2])
+    assert (small.camera.width, small.camera.height) == (width, height)
+    alpha = frame.rgba[:2, :2, 3].astype(float).sum() / 4
+    assert abs(float(small.rgba[0, 0, 3]) - alpha) <= 0.5
+    solid = np.argwhere(small.rgba[..., 3] == 255)[0]
+    square = frame.rgba[2 * solid[0] : 2 * solid[0] + 2, 2 * solid[1] : 2 * solid[1] + 2, :3]
+    np.testing.assert_allclose(small.rgba[tuple(solid)][:3], square.mean((0, 1)), atol=0.51)
+    point = frame.vertices[:1]
+    large, _ = frame.camera.project(point)
+    np.testing.assert_allclose(small.camera.project(point)[0], large / 2, atol=1e-9)
 
 
 def test_training_learns_the_person_and_tells_the_appearances_apart(toy, toy_avatar):

@@ -18,3 +18,9 @@ def head_rotation(canonical: np.ndarray, posed: np.ndarray, weights: np.ndarray)
     u, _, vt = np.linalg.svd((w * b).T @ a)
     flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt)) or 1.0])
     return (u @ flip @ vt).astype(np.float32)
+
+
+def turn(rotation: np.ndarray) -> np.ndarray:
+    """A rotation [3, 3] as its axis times the sine of its angle, [3] float32."""
+    skew = rotation - rotation.T
+    return (np.array([skew[2, 1], skew[0, 2], skew[1, 0]]) / 2).astype(np.float32)

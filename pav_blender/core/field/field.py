@@ -19,11 +19,13 @@ import itertools
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import nn
 
 from .. import kernels
 from ..config import Config
+from ..deformation.rigid import turn
 from ..kernels.reference.encoding import FEATURES, Layout
 from . import directions
 
@@ -35,7 +37,7 @@ class Samples:
     canonical [N, 3] in the field's unit box; triangle [N] int32; barycentric [N, 3];
     distance [N], metres from the posed mesh;
     appearance [N] int32, frame [N] int32, ray [N] int32 (rows of what follows);
-    expression [frames, E]; direction [rays, 3], unit, in the head's own axes.
+    condition [frames, E] (see `condition`); direction [rays, 3], unit, in the head's own axes.
     """
 
     canonical: torch.Tensor
@@ -45,8 +47,22 @@ class Samples:
     appearance: torch.Tensor
     frame: torch.Tensor
     ray: torch.Tensor
-    expression: torch.Tensor
+    condition: torch.Tensor
     direction: torch.Tensor
+
+
+TURN = 3
+
+
+def condition(
+    config: Config, expression: np.ndarray | torch.Tensor, rotation: np.ndarray
+) -> torch.Tensor:
+    """What the density depends on besides the place, [E + 3 or E]: the expression [E], and how
+    the skull is turned (rotation [3, 3] from the canonical mesh)."""
+    values = torch.as_tensor(expression).float()
+    if not config.sees_turn:
+        return values
+    return torch.cat([values, torch.from_numpy(turn(rotation))])
 
 
 @dataclass
@@ -129,13 +145,14 @@ class Field(nn.Module):
         codes = config.latent_channels if config.appearance_code and mapped else 0
         self.code = nn.Parameter(torch.randn(appearances, codes) * 0.5)
         embedding, geometry = config.embedding_channels, config.geometry_channels
+        conditions = expressions + (TURN if config.sees_turn else 0)
         self.density = Mlp(
-            self.layout.width, expressions, config.hidden, config.density_layers, geometry
+            self.layout.width, conditions, config.hidden, config.density_layers, geometry
         )
         self.offset: Mlp | None = None
         if config.density_offset and embedding:
             seen = geometry - 1 if config.offset_sees_geometry else 0
-            self.offset = Mlp(embedding + seen, expressions, config.hidden, config.offset_layers, 1)
+            self.offset = Mlp(embedding + seen, conditions, config.hidden, config.offset_layers, 1)
             # starts as next to no offset: the shared density comes first
             nn.init.normal_(self.offset.weights[-1], 0, 1e-2)
         self.colour = Mlp(
@@ -168,20 +185,33 @@ class Field(nn.Module):
         ops = kernels.select(self.tables.device)
         return ops.encoding.encode(samples.canonical, self.tables, self.layout)
 
-    def _geometry(
-        self, samples: Samples, worn: Worn, encoded: torch.Tensor | None = None
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Log-density before its bias [N, 1], geometry features [N, C - 1], embedding Z^x."""
+    def geometry(
+        self, samples: Samples, worn: Worn | None = None, encoded: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Density [N] per metre, and what the colour depends on besides the view [N, C].
+
+        `worn` stands in for the learned appearances, e.g. a blend of them (see `blend`); `encoded`
+        for phi(x_c), where it is at hand.
+        """
         if encoded is None:
             encoded = self.encode(samples)
-        geometry = self.density(encoded, samples.expression, samples.frame)
+        geometry = self.density(encoded, samples.condition, samples.frame)
         raw, features = geometry[:, :1], geometry[:, 1:]
-        embedding = self.embedding(samples, worn)
+        embedding = self.embedding(samples, worn or self.worn)
         if self.offset is not None:
             sees = self.config.offset_sees_geometry
             seen = torch.cat([embedding, features], 1) if sees else embedding
-            raw = raw + self.offset(seen, samples.expression, samples.frame)
-        return raw, features, embedding
+            raw = raw + self.offset(seen, samples.condition, samples.frame)
+        inputs = torch.cat([embedding, raw, features], 1)
+        return self._density(raw, samples.distance), inputs
+
+    def shade(
+        self, inputs: torch.Tensor, direction: torch.Tensor, ray: torch.Tensor
+    ) -> torch.Tensor:
+        """Colour [N, 3], sRGB in [0, 1]: inputs [N, C] from `geometry`, unit directions [R, 3] in
+        the head's axes and each sample's row of them [N] int32."""
+        view = directions.spherical_harmonics(direction)
+        return torch.sigmoid(self.colour(inputs, view, ray))
 
     def untrained(self, distance: torch.Tensor) -> torch.Tensor:
         """Log-density a millimetre of an untrained field, metres from the mesh."""
@@ -197,24 +227,12 @@ class Field(nn.Module):
         # the clamp also stops the gradient there, so that weights do not run away
         return torch.exp(torch.clamp(log_density, max=config.log_density_limit)) * 1e3
 
-    def densities(self, samples: Samples, worn: Worn | None = None) -> torch.Tensor:
-        """Density alone [N], per metre: what a ray needs to know where it ends."""
-        raw = self._geometry(samples, worn or self.worn)[0]
-        return self._density(raw, samples.distance)
-
     def forward(
         self, samples: Samples, worn: Worn | None = None, encoded: torch.Tensor | None = None
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Density [N] per metre and colour [N, 3], sRGB in [0, 1].
-
-        `worn` stands in for the learned appearances, e.g. a blend of them (see `blend`);
-        `encoded` for phi(x_c), where it is at hand.
-        """
-        raw, features, embedding = self._geometry(samples, worn or self.worn, encoded)
-        inputs = torch.cat([embedding, raw, features], 1)
-        view = directions.spherical_harmonics(samples.direction)
-        colour = torch.sigmoid(self.colour(inputs, view, samples.ray))
-        return self._density(raw, samples.distance), colour
+        """Density [N] per metre and colour [N, 3], sRGB in [0, 1]; arguments as `geometry`."""
+        density, inputs = self.geometry(samples, worn, encoded)
+        return density, self.shade(inputs, samples.direction, samples.ray)
 
     @property
     def worn(self) -> Worn:

@@ -76,11 +76,12 @@ def samples_of(
     packed: Packed,
     clearance: Clearance,
     appearance: int,
-    expression: torch.Tensor,
+    condition: torch.Tensor,
     directions: torch.Tensor,
     head_rotation: np.ndarray,
 ) -> Samples:
-    """What the field needs for samples of one frame: expression [E], ray directions [R, 3]."""
+    """What the field needs for samples of one frame; condition [E] as `field.condition` made it,
+    ray directions [R, 3]."""
     count = len(packed)
     turned = directions @ torch.from_numpy(head_rotation)
     return Samples(
@@ -91,6 +92,6 @@ def samples_of(
         appearance=torch.full((count,), appearance, dtype=torch.int32),
         frame=torch.zeros(count, dtype=torch.int32),
         ray=packed.ray,
-        expression=expression[None],
+        condition=condition[None],
         direction=turned,
     )

@@ -10,11 +10,11 @@ import numpy as np
 import torch
 
 from .. import kernels
-from ..deformation import Clearance, Deformer, PosedMesh, clearance
+from ..deformation import Clearance, Deformer, PosedMesh, box, clearance, shell
 from ..deformation.rigid import head_rotation
 from ..errors import Cancelled, InputError
 from ..field.avatar import Avatar
-from ..field.field import Worn
+from ..field.field import Worn, condition
 from ..kernels.cpu.threads import torch_alone
 from .cameras import Camera
 from .rays import RayBatch, camera_rays, pack, samples_of
@@ -26,14 +26,16 @@ Appearance = str | Mapping[str, float]
 class RenderSettings:
     """step: metres between samples; transmittance: a ray ends when less of it is left.
 
-    band: metres round the mesh that are sampled; skip: leap over cells known to be empty;
-    wave: samples a ray between two looks at its transmittance; chunk: rays at once.
+    skip: leap over cells known to be empty; negligible: weight in a pixel below which a sample's
+    colour is not asked for; wave: samples a ray between two looks at its transmittance; chunk:
+    rays at once.
     """
 
-    step: float = 1e-3
+    step: float = 1.5e-3
     transmittance: float = 1e-3
     skip: bool = True
-    wave: int = 6
+    negligible: float = 1e-4
+    wave: int = 12
     chunk: int = 16_384
 
     @classmethod
@@ -42,7 +44,7 @@ class RenderSettings:
         presets = {
             "preview": cls(step=2.5e-3, transmittance=1e-2),
             "final": cls(),
-            "reference": cls(step=3.9e-4, transmittance=0.0, skip=False, wave=64),
+            "reference": cls(step=3.9e-4, transmittance=0.0, skip=False, negligible=0.0, wave=64),
         }
         if name not in presets:
             raise InputError(f"quality {name!r}: one of {', '.join(presets)}")
@@ -64,8 +66,9 @@ class Scene:
     avatar: Avatar
     mesh: PosedMesh
     clearance: Clearance
+    shell: Clearance
     rotation: np.ndarray
-    expression: torch.Tensor
+    condition: torch.Tensor
     worn: Worn
 
 
@@ -135,12 +138,15 @@ def pose_scene(
         raise InputError(f"expression: {values.shape} values; the avatar takes {count} finite ones")
     weights = appearance_weights(avatar, appearance)
     rows = tuple(int(i) for i in np.flatnonzero(weights))
+    rotation = head_rotation(avatar.canonical_vertices, vertices, avatar.rigid_weights)
+    mesh, space = deformer_of(avatar).pose(vertices), space_of(avatar, rows)
     return Scene(
         avatar,
-        deformer_of(avatar).pose(vertices),
-        space_of(avatar, rows),
-        head_rotation(avatar.canonical_vertices, vertices, avatar.rigid_weights),
-        torch.from_numpy(values.astype(np.float32)),
+        mesh,
+        space,
+        shell(mesh, space, avatar.config.reach),
+        rotation,
+        condition(avatar.config, values.astype(np.float32), rotation),
         avatar.field.blend(torch.from_numpy(weights)),
     )
 
@@ -185,12 +191,17 @@ def render(
 def _trace(scene: Scene, rays: RayBatch, settings: RenderSettings) -> tuple[np.ndarray, np.ndarray]:
     """Straight RGBA [R, 4] and depth along the camera's axis [R]."""
     count = len(rays)
-    colour, opacity = torch.zeros(count, 3), torch.zeros(count)
+    # the colours of what was worth a look, and how much of the ray that was
+    colour, no_colour = torch.zeros(count, 4), torch.zeros(count, 3)
+    opacity = torch.zeros(count)
     depth, left = torch.zeros(count), torch.ones(count)
     ops = kernels.select("cpu")
     jitter = torch.full((count,), 0.5)
-    margin = scene.avatar.config.reach
-    near, far = ops.marching.bounds(scene.mesh.vertices, margin, rays.origins, rays.directions)
+    field, reach = scene.avatar.field, scene.avatar.config.reach
+    around = box(scene.shell), 0.0
+    if not settings.skip:
+        around = scene.mesh.vertices, reach
+    near, far = ops.marching.bounds(*around, rays.origins, rays.directions)
     first, last = ops.marching.lattice(near, far, jitter, settings.step)
     alive = (last >= first).nonzero()[:, 0]
     while len(alive):
@@ -205,32 +216,32 @@ def _trace(scene: Scene, rays: RayBatch, settings: RenderSettings) -> tuple[np.n
             settings.step,
             wave=settings.wave,
             clearance=scene.clearance,
-            band=margin,
+            shell=scene.shell if settings.skip else None,
+            band=reach,
             leap_limit=0.004 if settings.skip else 0.0,
         )
         packed, _ = pack(wave, jitter[alive], settings.step)
         if len(packed):
             samples = samples_of(
-                packed, scene.clearance, 0, scene.expression, part.directions, scene.rotation
+                packed, scene.clearance, 0, scene.condition, part.directions, scene.rotation
             )
-            sigma, rgb = scene.avatar.field(samples, scene.worn)
-            ops.marching.composite_step(
-                sigma,
-                rgb,
-                packed.t,
-                settings.step,
-                alive[packed.ray.long()].int(),
-                left,
-                colour,
-                opacity,
-                depth,
+            sigma, inputs = field.geometry(samples, scene.worn)
+            ray = alive[packed.ray.long()]
+            no_rgb = torch.zeros(len(packed), 3)
+            sums = left, no_colour, opacity, depth
+            weights = ops.marching.composite_step(
+                sigma, no_rgb, packed.t, settings.step, ray.int(), *sums
             )
+            shown = (weights > settings.negligible).nonzero()[:, 0]
+            rgb = field.shade(inputs[shown], samples.direction, samples.ray[shown])
+            weight = weights[shown, None]
+            colour.index_add_(0, ray[shown], torch.cat([weight * rgb, weight], 1))
         first[alive] = wave.next
         going = (wave.next <= last[alive]) & (left[alive] > settings.transmittance)
         alive = alive[going]
-    seen = opacity > 1e-4
+    seen = (opacity > 1e-4) & (colour[:, 3] > 0)
     safe = torch.where(seen, opacity, 1.0)[:, None]
-    straight = (colour / safe).clamp(0, 1)
+    straight = (colour[:, :3] / torch.where(seen, colour[:, 3], 1.0)[:, None]).clamp(0, 1)
     # a ray that was ended early is opaque: what is left of it would be seen through nothing
     alpha = torch.where(left <= settings.transmittance, 1.0, opacity).clamp(0, 1)
     rgba = torch.where(seen[:, None], torch.cat([straight, alpha[:, None]], 1), 0.0)

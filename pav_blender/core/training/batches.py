@@ -9,9 +9,10 @@ import numpy as np
 import torch
 
 from .. import kernels
+from ..config import Config
 from ..deformation import Clearance, Deformer, PosedMesh, box, shell
 from ..deformation.rigid import head_rotation
-from ..field.field import Samples
+from ..field.field import Samples, condition
 from ..rendering.rays import Packed, RayBatch, camera_rays, pack
 from .frames import TILE, Frame
 from .occupancy import Visibility
@@ -135,7 +136,7 @@ def pick_samples(
     poses: Poses,
     pixels: Pixels,
     visibility: Visibility,
-    reach: float,
+    config: Config,
     step: float,
     generator: torch.Generator,
 ) -> Picked:
@@ -145,12 +146,12 @@ def pick_samples(
     stops = [*pixels.starts[1:], count]
     jitter, chance = torch.rand(2, count, generator=generator)
     parts: list[Packed] = []
-    steps, directions, frame, ended = [], [], [], []
+    steps, directions, frame, ended, conditions = [], [], [], [], []
     looks = 0
     for index, (a, b) in enumerate(zip(pixels.starts, stops, strict=True)):
         appearance = pixels.frames[index].appearance
         space = visibility.spaces[appearance]
-        posed = poses(pixels.frames[index], space, visibility.version, reach)
+        posed = poses(pixels.frames[index], space, visibility.version, config.reach)
         rays = pixels.rays.origins[a:b], pixels.rays.directions[a:b]
         near, far = ops.marching.bounds(box(posed.shell), 0.0, *rays)
         picks = ops.picking.pick(
@@ -163,7 +164,7 @@ def pick_samples(
             clearance=space,
             guide=visibility.guide[appearance],
             shell=posed.shell,
-            band=reach,
+            band=config.reach,
         )
         looks += int(picks.looks.sum())
         ended.append(picks.ended)
@@ -172,6 +173,8 @@ def pick_samples(
         parts.append(packed)
         steps.append(picks.steps.view(-1)[slots])
         frame.append(torch.full((len(packed),), index, dtype=torch.int32))
+        expression = pixels.frames[index].expression
+        conditions.append(condition(config, expression, posed.rotation))
         directions.append(rays[1] @ torch.from_numpy(posed.rotation))
     fields = ("ray", "t", "triangle", "barycentric", "canonical", "distance")
     packed = Packed(*(torch.cat([getattr(p, name) for p in parts]) for name in fields))
@@ -186,7 +189,7 @@ def pick_samples(
         appearance=appearances[frames.long()],
         frame=frames,
         ray=packed.ray,
-        expression=torch.from_numpy(np.stack([f.expression for f in pixels.frames])),
+        condition=torch.stack(conditions),
         direction=torch.cat(directions),
     )
     width, cells = torch.cat(steps) * step, _cells(samples, space)

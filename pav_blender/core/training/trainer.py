@@ -21,7 +21,7 @@ from .occupancy import Visibility, first_guide
 
 _FIRST_STEP = 8.0  # the first samples are this many times as far apart as the last
 _LOOKS_A_RAY = 24  # the step is as fine as this many looks a ray allow
-_SAMPLES = 1 << 15  # samples a batch, by the number of its rays
+_SAMPLES = 1 << 14  # samples a batch, by the number of its rays
 _CARVED = 0.5  # part of the schedule in which space is emptied often
 _PRUNE_EVERY = 40  # iterations, while there is much to empty
 _PRUNE_LATER = 200
@@ -101,7 +101,7 @@ class Trainer:
         count = len(pixels.rays)
         with torch.no_grad():
             picked = pick_samples(
-                self._poses, pixels, self.visibility, config.reach, status.step, self.generator
+                self._poses, pixels, self.visibility, config, status.step, self.generator
             )
             encoded = field.encode(picked.samples)
         ops = kernels.select("cpu")
