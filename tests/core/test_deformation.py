@@ -8,6 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from pav_blender.core.deformation import Deformer, canonicalise, clearance, triangle_maps
+from pav_blender.core.deformation.rigid import head_turn
 from pav_blender.core.errors import InputError
 from pav_blender.core.kernels import select
 
@@ -189,3 +190,21 @@ def test_clearance_of_nothing_and_of_much():
     long = np.zeros((300, 1, 1), bool)
     long[0] = True
     assert clearance(long)[-1, 0, 0] == 255
+
+
+def test_the_heads_turn_is_against_the_shoulders_wherever_all_of_it_goes():
+    rng = np.random.default_rng(0)
+    skull = rng.normal(0, 0.08, (60, 3)) + [0, 0.3, 0]
+    shoulders = rng.normal(0, 0.1, (40, 3)) + [0, -0.3, 0]
+    canonical = np.concatenate([skull, shoulders]).astype(np.float32)
+    weights = np.repeat(np.float32([1, 0]), [60, 40])
+    angle = 0.3
+    about_y = np.array(
+        [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+    )
+    posed = np.concatenate([skull @ about_y.T, shoulders])
+    everywhere, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    everywhere *= np.sign(np.linalg.det(everywhere))
+    for rotation, shift in ((np.eye(3), 0.0), (everywhere, 0.4)):
+        found = head_turn(canonical, (posed @ rotation.T + shift).astype(np.float32), weights)
+        np.testing.assert_allclose(found, [0, np.sin(angle), 0], atol=1e-5)

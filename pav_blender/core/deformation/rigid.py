@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+_END = 0.8  # part of the mesh that is nearer to the skull than what it is turned against
+
 
 def head_rotation(canonical: np.ndarray, posed: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Rotation [3, 3], float32, that best turns the canonical mesh [V, 3] into the posed one.
@@ -20,7 +22,12 @@ def head_rotation(canonical: np.ndarray, posed: np.ndarray, weights: np.ndarray)
     return (u @ flip @ vt).astype(np.float32)
 
 
-def turn(rotation: np.ndarray) -> np.ndarray:
-    """A rotation [3, 3] as its axis times the sine of its angle, [3] float32."""
-    skew = rotation - rotation.T
+def head_turn(canonical: np.ndarray, posed: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """How the skull is turned against the shoulders (or whatever the mesh ends in): the axis times
+    the sine of the angle, [3] float32, in canonical axes."""
+    skull = (weights[:, None] * canonical).sum(0) / max(float(weights.sum()), 1e-12)
+    away = np.linalg.norm(canonical - skull, axis=1)
+    end = (away >= np.quantile(away, _END)).astype(np.float32)
+    turned = head_rotation(canonical, posed, end).T @ head_rotation(canonical, posed, weights)
+    skew = turned - turned.T
     return (np.array([skew[2, 1], skew[0, 2], skew[1, 0]]) / 2).astype(np.float32)

@@ -25,7 +25,6 @@ from torch import nn
 
 from .. import kernels
 from ..config import Config
-from ..deformation.rigid import turn
 from ..kernels.reference.encoding import FEATURES, Layout
 from . import directions
 
@@ -55,14 +54,12 @@ TURN = 3
 
 
 def condition(
-    config: Config, expression: np.ndarray | torch.Tensor, rotation: np.ndarray
+    config: Config, expression: np.ndarray | torch.Tensor, turn: np.ndarray
 ) -> torch.Tensor:
-    """What the density depends on besides the place, [E + 3 or E]: the expression [E], and how
-    the skull is turned (rotation [3, 3] from the canonical mesh)."""
+    """What the density depends on besides the place, [E + 3 or E]: the expression [E] and the
+    head's turn [3] (`deformation.rigid.head_turn`)."""
     values = torch.as_tensor(expression).float()
-    if not config.sees_turn:
-        return values
-    return torch.cat([values, torch.from_numpy(turn(rotation))])
+    return torch.cat([values, torch.from_numpy(turn)]) if config.sees_turn else values
 
 
 @dataclass

@@ -11,7 +11,7 @@ import torch
 
 from .. import kernels
 from ..deformation import Clearance, Deformer, PosedMesh, box, clearance, shell
-from ..deformation.rigid import head_rotation
+from ..deformation.rigid import head_rotation, head_turn
 from ..errors import Cancelled, InputError
 from ..field.avatar import Avatar
 from ..field.field import Worn, condition
@@ -26,7 +26,7 @@ Appearance = str | Mapping[str, float]
 class RenderSettings:
     """step: metres between samples; transmittance: a ray ends when less of it is left.
 
-    skip: leap over cells known to be empty; negligible: weight in a pixel below which a sample's
+    skip: leap over cells known to be empty; negligible: weight a metre below which a sample's
     colour is not asked for; wave: samples a ray between two looks at its transmittance; chunk:
     rays at once.
     """
@@ -34,7 +34,7 @@ class RenderSettings:
     step: float = 1.5e-3
     transmittance: float = 1e-3
     skip: bool = True
-    negligible: float = 1e-4
+    negligible: float = 0.05
     wave: int = 12
     chunk: int = 16_384
 
@@ -138,7 +138,9 @@ def pose_scene(
         raise InputError(f"expression: {values.shape} values; the avatar takes {count} finite ones")
     weights = appearance_weights(avatar, appearance)
     rows = tuple(int(i) for i in np.flatnonzero(weights))
-    rotation = head_rotation(avatar.canonical_vertices, vertices, avatar.rigid_weights)
+    canonical = avatar.canonical_vertices
+    rotation = head_rotation(canonical, vertices, avatar.rigid_weights)
+    turn = head_turn(canonical, vertices, avatar.rigid_weights)
     mesh, space = deformer_of(avatar).pose(vertices), space_of(avatar, rows)
     return Scene(
         avatar,
@@ -146,7 +148,7 @@ def pose_scene(
         space,
         shell(mesh, space, avatar.config.reach),
         rotation,
-        condition(avatar.config, values.astype(np.float32), rotation),
+        condition(avatar.config, values.astype(np.float32), turn),
         avatar.field.blend(torch.from_numpy(weights)),
     )
 
@@ -232,7 +234,7 @@ def _trace(scene: Scene, rays: RayBatch, settings: RenderSettings) -> tuple[np.n
             weights = ops.marching.composite_step(
                 sigma, no_rgb, packed.t, settings.step, ray.int(), *sums
             )
-            shown = (weights > settings.negligible).nonzero()[:, 0]
+            shown = (weights > settings.negligible * settings.step).nonzero()[:, 0]
             rgb = field.shade(inputs[shown], samples.direction, samples.ray[shown])
             weight = weights[shown, None]
             colour.index_add_(0, ray[shown], torch.cat([weight * rgb, weight], 1))

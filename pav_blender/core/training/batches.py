@@ -11,7 +11,7 @@ import torch
 from .. import kernels
 from ..config import Config
 from ..deformation import Clearance, Deformer, PosedMesh, box, shell
-from ..deformation.rigid import head_rotation
+from ..deformation.rigid import head_rotation, head_turn
 from ..field.field import Samples, condition
 from ..rendering.rays import Packed, RayBatch, camera_rays, pack
 from .frames import TILE, Frame
@@ -52,6 +52,7 @@ class Picked:
 class _Posed:
     mesh: PosedMesh
     rotation: np.ndarray
+    turn: np.ndarray
     shell: Clearance
     version: int
 
@@ -71,8 +72,10 @@ class Poses:
         known = self._kept.get(frame.name)
         if known is None:
             mesh = self._deformer.pose(frame.vertices)
-            rotation = head_rotation(self._canonical, frame.vertices, self._weights)
-            known = _Posed(mesh, rotation, shell(mesh, space, reach), version)
+            meshes = self._canonical, frame.vertices, self._weights
+            known = _Posed(
+                mesh, head_rotation(*meshes), head_turn(*meshes), shell(mesh, space, reach), version
+            )
             self._kept[frame.name] = known
             if len(self._kept) > _KEPT_POSES:
                 self._kept.popitem(last=False)
@@ -174,7 +177,7 @@ def pick_samples(
         steps.append(picks.steps.view(-1)[slots])
         frame.append(torch.full((len(packed),), index, dtype=torch.int32))
         expression = pixels.frames[index].expression
-        conditions.append(condition(config, expression, posed.rotation))
+        conditions.append(condition(config, expression, posed.turn))
         directions.append(rays[1] @ torch.from_numpy(posed.rotation))
     fields = ("ray", "t", "triangle", "barycentric", "canonical", "distance")
     packed = Packed(*(torch.cat([getattr(p, name) for p in parts]) for name in fields))
