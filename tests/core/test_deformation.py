@@ -194,8 +194,8 @@ def test_clearance_of_nothing_and_of_much():
 
 def test_the_heads_turn_is_against_the_shoulders_wherever_all_of_it_goes():
     rng = np.random.default_rng(0)
-    skull = rng.normal(0, 0.08, (60, 3)) + [0, 0.3, 0]
-    shoulders = rng.normal(0, 0.1, (40, 3)) + [0, -0.3, 0]
+    skull = rng.normal((0, 0.3, 0), 0.08, (60, 3))
+    shoulders = rng.normal((0, -0.3, 0), 0.1, (40, 3))
     canonical = np.concatenate([skull, shoulders]).astype(np.float32)
     weights = np.repeat(np.float32([1, 0]), [60, 40])
     angle = 0.3

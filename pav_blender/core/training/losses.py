@@ -37,7 +37,8 @@ def losses(
     alpha = pixels.alpha[:, None]
     target = pixels.colour * alpha + background * (1 - alpha)
     shown = colour + background * (1 - opacity[:, None])
-    mse = torch.where(counted[:, None], (shown - target).square(), 0.0).mean()
+    squared = torch.where(counted[:, None], (shown - target).square(), 0.0)
+    mse = squared.sum() / (3 * counted.sum().clamp(min=1))
     face = (pixels.depth > 0) & counted
     gap = torch.where(face, (depth * pixels.rays.cosine - pixels.depth).abs(), 0.0).mean()
     total = config.colour_weight * mse + config.depth_weight * gap

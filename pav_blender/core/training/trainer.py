@@ -113,7 +113,6 @@ class Trainer:
         # what lies behind where a ray was ended by mistake must not be laid to what is before it
         counted = ~picked.ended | (opacity.detach() > 1 - _ENDED)
         loss = losses(config, pixels, background, colour, opacity, depth, counted)
-        self.uncounted = 1 - float(counted.float().mean())
         if torch.isfinite(loss.total):
             loss.total.backward()
             self._adam(picked.samples.canonical, encoded)
