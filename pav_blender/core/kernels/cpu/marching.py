@@ -7,6 +7,8 @@ which neighbours are neighbours in the picture (tiles of 4x4 pixels).
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from numba import njit
@@ -276,16 +278,9 @@ def march_rays(
                     clear = (distance - band) * np.float32(0.99999)
                 else:
                     cells = 0
+                    u, v, w = canonical[i], canonical[LANES + i], canonical[2 * LANES + i]
                     if size > 0:
-                        cells = _clear_cells(
-                            grid,
-                            size,
-                            corner,
-                            scale,
-                            canonical[i],
-                            canonical[LANES + i],
-                            canonical[2 * LANES + i],
-                        )
+                        cells = _clear_cells(grid, size, corner, scale, u, v, w)
                     if cells == 0:
                         slot = out_count[ray]
                         out_k[ray, slot] = k
@@ -296,14 +291,7 @@ def march_rays(
                             out_canonical[ray, slot, axis] = canonical[axis * LANES + i]
                         out_count[ray] = slot + 1
                         if guided:
-                            at = _cell(
-                                size,
-                                corner,
-                                scale,
-                                canonical[i],
-                                canonical[LANES + i],
-                                canonical[2 * LANES + i],
-                            )
+                            at = _cell(size, corner, scale, u, v, w)
                             out_density[ray, slot] = guide[at]
                             passed[i] += guide[at] * step
                         if slot + 1 == wave or passed[i] > opaque:
@@ -353,6 +341,39 @@ def grid_of(clearance: Clearance | None) -> tuple[np.ndarray, int, np.ndarray, n
     return grid, size, flat(clearance.box_min), np.float32(clearance.box_scale * size)
 
 
+def walk(
+    mesh: PosedMesh,
+    origins: torch.Tensor,
+    directions: torch.Tensor,
+    first: torch.Tensor,
+    last: torch.Tensor,
+    jitter: torch.Tensor,
+    step: float,
+    clearance: Clearance | None,
+    shell: Clearance | None,
+    band: float,
+    leap_limit: float,
+) -> tuple[Any, ...]:
+    """What `march_rays` is told of where to go, arguments as `march`."""
+    return (
+        mesh.search.arrays,
+        flat(mesh.triangle_maps),
+        flat(mesh.vertex_maps),
+        flat(mesh.vertices),
+        mesh.search.topology.corners.reshape(-1),
+        rows_of(origins, np.float32),
+        rows_of(directions, np.float32),
+        rows_of(first, np.int32),
+        rows_of(last, np.int32),
+        rows_of(jitter, np.float32),
+        np.float32(step),
+        *grid_of(clearance),
+        *grid_of(shell),
+        np.float32(band),
+        np.float32(leap_limit),
+    )
+
+
 def march(
     mesh: PosedMesh,
     origins: torch.Tensor,
@@ -390,21 +411,9 @@ def march(
         march_rays,
         count,
         _CHUNK,
-        mesh.search.arrays,
-        flat(mesh.triangle_maps),
-        flat(mesh.vertex_maps),
-        flat(mesh.vertices),
-        mesh.search.topology.corners.reshape(-1),
-        rows_of(origins, np.float32),
-        rows_of(directions, np.float32),
-        rows_of(first, np.int32),
-        rows_of(last, np.int32),
-        rows_of(jitter, np.float32),
-        np.float32(step),
-        *grid_of(clearance),
-        *grid_of(shell),
-        np.float32(band),
-        np.float32(leap_limit),
+        *walk(
+            mesh, origins, directions, first, last, jitter, step, clearance, shell, band, leap_limit
+        ),
         _NOTHING,
         np.float32(np.inf),
         wave,

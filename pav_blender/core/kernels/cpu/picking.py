@@ -8,7 +8,7 @@ from numba import njit
 
 from ..reference.picking import FALL, LEAST, LONGEST, LOOKS, OPAQUE, RISE, SHARE, WIDTH
 from ..structures import Clearance, Picks, PosedMesh
-from .marching import flat, grid_of, march_rays, rows_of
+from .marching import flat, march_rays, rows_of, walk
 from .search import OPTIONS
 from .threads import run_chunks
 
@@ -50,22 +50,10 @@ def pick(
         _pick,
         count,
         _CHUNK,
-        mesh.search.arrays,
-        flat(mesh.triangle_maps),
-        flat(mesh.vertex_maps),
-        flat(mesh.vertices),
-        mesh.search.topology.corners.reshape(-1),
-        rows_of(origins, np.float32),
-        rows_of(directions, np.float32),
-        rows_of(first, np.int32),
-        rows_of(last, np.int32),
-        rows_of(jitter, np.float32),
+        *walk(
+            mesh, origins, directions, first, last, jitter, step, clearance, shell, band, leap_limit
+        ),
         rows_of(random, np.float32),
-        np.float32(step),
-        *grid_of(clearance),
-        *grid_of(shell),
-        np.float32(band),
-        np.float32(leap_limit),
         flat(guide),
         *(values.numpy() for values in result),
     )
@@ -74,10 +62,10 @@ def pick(
 
 @njit(**OPTIONS)
 def _pick(start, stop, arrays, triangle_maps, vertex_maps, vertices, corners,
-          origins, directions, first, last, jitter, random, step,
+          origins, directions, first, last, jitter, step,
           grid, size, corner, scale, shell, shell_size, shell_corner, shell_scale,
-          band, leap_limit, guide, out_count, out_looks, out_ended, out_k, out_steps, out_triangle,
-          out_barycentric, out_canonical, out_distance):  # fmt: skip
+          band, leap_limit, random, guide, out_count, out_looks, out_ended, out_k, out_steps,
+          out_triangle, out_barycentric, out_canonical, out_distance):  # fmt: skip
     rays = stop - start
     density = np.empty((rays, LOOKS), np.float32)
     looks = np.zeros(rays, np.int32)
