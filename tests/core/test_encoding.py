@@ -172,27 +172,6 @@ def test_gradients_are_added_not_written(kernels):
     assert once.abs().sum() > 0
 
 
-@BOTH
-def test_a_gradient_can_be_given_a_place(kernels):
-    """With grad_into nothing is returned and the same numbers are added there."""
-    latent, appearance, uv = texture_input(50)
-    features, which, triangles, triangle, barycentric = vertices_input(50)
-    cases = [
-        (random_tables(SMALL), lambda t, **k: kernels.encode(random_points(50), t, SMALL, **k)),
-        (latent, lambda t, **k: kernels.read_texture(t, appearance, uv, **k)),
-        (features, lambda t, **k: kernels.read_vertices(
-            t, which, triangles, triangle, barycentric, **k)),
-    ]  # fmt: skip
-    for source, read in cases:
-        leaf = source.clone().requires_grad_()
-        (want,) = torch.autograd.grad(read(leaf).square().sum(), leaf)
-        place = torch.ones_like(source)
-        out = read(leaf, grad_into=place)
-        out.square().sum().backward()
-        assert leaf.grad is None
-        torch.testing.assert_close(place, want + 1)
-
-
 @pytest.mark.parametrize(("layout", "count"), [(SMALL, 0), (SMALL, 700), (FULL, 700)])
 def test_adam_on_tables_is_backward_and_then_adam(layout, count):
     points, tables = random_points(count), random_tables(layout)
@@ -298,19 +277,6 @@ def test_texture_agrees_with_double_precision(size, channels, count):
     (wanted,) = torch.autograd.grad(want, double, weight.double())
     bound = 1e-6 * size * (1 + count / size**2)
     torch.testing.assert_close(grad.double(), wanted, rtol=1e-4, atol=bound)
-
-
-@pytest.mark.parametrize("count", [0, 1, 5000])
-def test_texels_read_are_those_with_a_gradient(count):
-    latent, appearance, uv = texture_input(count, 40)
-    rows = cpu.texels_read(tuple(latent.shape), appearance, uv)
-    assert torch.equal(rows, reference.texels_read(tuple(latent.shape), appearance, uv))
-    grad = torch.zeros_like(latent)
-    cpu.read_texture_backward_into(appearance, uv, torch.ones(count, 5), grad)
-    touched = grad.view(-1, 5).abs().sum(1).nonzero().squeeze(1)
-    assert set(touched.tolist()) <= set(rows.tolist())
-    # At the borders a texel may be read with a weight of nothing.
-    assert len(rows) - len(touched) <= 2 + 0.02 * len(rows)
 
 
 def test_hostile_uv_is_clamped():

@@ -252,21 +252,17 @@ def test_composite_by_hand():
 
 
 @pytest.mark.parametrize("kernels", [CPU, REFERENCE])
-def test_waves_of_compositing_add_up(kernels):
+def test_waves_of_weights_are_those_of_the_whole(kernels):
     sigma, rgb, t, index = packed()
     whole = kernels.composite(sigma, rgb, t, 0.003, index, 40)
     left = torch.ones(40)
-    sums = torch.zeros(40, 3), torch.zeros(40), torch.zeros(40)
     start = torch.searchsorted(index.long(), torch.arange(40))
     place = torch.arange(len(index)) - start[index.long()]
     weights = torch.zeros(len(index))
     for low in range(0, 40, 4):
         part = (place >= low) & (place < low + 4)
-        weights[part] = kernels.composite_step(
-            sigma[part], rgb[part], t[part], 0.003, index[part], left, *sums
-        )
-    for got, want in zip((*sums, weights), whole, strict=True):
-        torch.testing.assert_close(got, want, rtol=1e-5, atol=1e-6)
+        weights[part] = kernels.weigh(sigma[part], 0.003, index[part], left)
+    torch.testing.assert_close(weights, whole[3], rtol=1e-5, atol=1e-6)
     torch.testing.assert_close(left, 1 - whole[1], rtol=0, atol=1e-6)
 
 

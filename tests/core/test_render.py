@@ -61,6 +61,13 @@ def test_ending_opaque_rays_changes_next_to_nothing(toy_avatar, pose):
     assert psnr(ended.rgba, whole.rgba) > 50
 
 
+def test_leaving_out_what_hardly_shows_changes_next_to_nothing(toy_avatar, pose):
+    usual = picture(toy_avatar, pose)
+    every = picture(toy_avatar, pose, settings=RenderSettings(negligible=0.0))
+    assert not np.array_equal(usual.rgba, every.rgba)
+    assert psnr(over(usual.rgba, 1.0), over(every.rgba, 1.0)) > 50
+
+
 def test_waves_and_chunks_do_not_show(toy_avatar, pose):
     usual = picture(toy_avatar, pose)
     other = picture(toy_avatar, pose, settings=RenderSettings(wave=3, chunk=1000))

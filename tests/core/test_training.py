@@ -14,8 +14,8 @@ from pav_blender.core.errors import Cancelled, InputError
 from pav_blender.core.evaluation.heldout import held_out, score
 from pav_blender.core.evaluation.report import figures, measure
 from pav_blender.core.field.avatar import Avatar
-from pav_blender.core.rendering.render import RenderSettings
-from pav_blender.core.training.batches import draw_pixels
+from pav_blender.core.rendering.render import RenderSettings, pose_scene
+from pav_blender.core.training.batches import draw_pixels, pick_samples
 from pav_blender.core.training.checkpoint import checkpoint_path
 from pav_blender.core.training.frames import halved
 from pav_blender.core.training.losses import losses
@@ -110,6 +110,48 @@ def test_a_halved_frame_is_the_mean_of_its_pixels_under_the_same_camera(frames):
     point = frame.vertices[:1]
     large, _ = frame.camera.project(point)
     np.testing.assert_allclose(small.camera.project(point)[0], large / 2, atol=1e-9)
+
+
+def test_training_sees_a_frame_as_rendering_does(toy, frames, small_config):
+    avatar = new_avatar(toy, frames, small_config)
+    trainer = Trainer(avatar, frames)
+    frame = frames[3]
+    pixels = draw_pixels([frame], 512, np.random.default_rng(0))
+    picked = pick_samples(
+        trainer._poses, pixels, trainer.visibility, small_config, 2e-3, trainer.generator
+    )
+    name = avatar.appearances[frame.appearance]
+    scene = pose_scene(avatar, frame.vertices, name, frame.expression)
+    assert scene.condition[-3:].abs().max() > 0.01  # the head is turned
+    torch.testing.assert_close(picked.samples.condition[0], scene.condition)
+    seen = pixels.rays.directions @ torch.from_numpy(scene.rotation)
+    torch.testing.assert_close(picked.samples.direction, seen)
+    assert torch.equal(picked.samples.appearance.unique(), torch.tensor([frame.appearance]).int())
+
+
+def test_small_pictures_come_first(toy, frames, small_config):
+    trainer = Trainer(new_avatar(toy, frames, small_config), frames)
+    full = frames[0].rgba.shape[0]
+    sizes = []
+    for done in (0.0, 0.3, 0.9):
+        trainer.status.iteration = int(done * small_config.iterations)
+        sizes.append(trainer._choose_frames()[0].rgba.shape[0])
+    assert sizes == [full // 4, full // 2, full]
+
+
+def test_rays_ended_by_mistake_teach_nothing(toy, frames, small_config):
+    """A guide that is opaque everywhere, a field that is thin everywhere: no weight may move."""
+    config = dataclasses.replace(small_config, start_on_mesh=False)
+    trainer = Trainer(new_avatar(toy, frames, config), frames)
+    before = {k: v.clone() for k, v in trainer.avatar.field.state_dict().items()}
+    trainer.visibility.guide.fill_(1e9)
+    trainer.iterate()
+    for name, value in trainer.avatar.field.state_dict().items():
+        assert torch.equal(value, before[name]), name
+    trainer.visibility.guide.fill_(1e-3)  # nor is that because there was nothing to learn
+    trainer.iterate()
+    after = trainer.avatar.field.state_dict()
+    assert not torch.equal(after["tables"], before["tables"])
 
 
 def test_training_learns_the_person_and_tells_the_appearances_apart(toy, toy_avatar):

@@ -22,12 +22,14 @@ def head_rotation(canonical: np.ndarray, posed: np.ndarray, weights: np.ndarray)
     return (u @ flip @ vt).astype(np.float32)
 
 
-def head_turn(canonical: np.ndarray, posed: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """How the skull is turned against the shoulders (or whatever the mesh ends in): the axis times
-    the sine of the angle, [3] float32, in canonical axes."""
+def head_turn(
+    canonical: np.ndarray, posed: np.ndarray, weights: np.ndarray, rotation: np.ndarray
+) -> np.ndarray:
+    """How the skull, turned by `rotation` (`head_rotation`'s), is turned against the shoulders, or
+    whatever the mesh ends in: axis times sine of the angle, [3] float32, in canonical axes."""
     skull = (weights[:, None] * canonical).sum(0) / max(float(weights.sum()), 1e-12)
     away = np.linalg.norm(canonical - skull, axis=1)
     end = (away >= np.quantile(away, _END)).astype(np.float32)
-    turned = head_rotation(canonical, posed, end).T @ head_rotation(canonical, posed, weights)
+    turned = head_rotation(canonical, posed, end).T @ rotation
     skew = turned - turned.T
     return (np.array([skew[2, 1], skew[0, 2], skew[1, 0]]) / 2).astype(np.float32)

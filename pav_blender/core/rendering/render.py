@@ -140,7 +140,7 @@ def pose_scene(
     rows = tuple(int(i) for i in np.flatnonzero(weights))
     canonical = avatar.canonical_vertices
     rotation = head_rotation(canonical, vertices, avatar.rigid_weights)
-    turn = head_turn(canonical, vertices, avatar.rigid_weights)
+    turn = head_turn(canonical, vertices, avatar.rigid_weights, rotation)
     mesh, space = deformer_of(avatar).pose(vertices), space_of(avatar, rows)
     return Scene(
         avatar,
@@ -194,9 +194,7 @@ def _trace(scene: Scene, rays: RayBatch, settings: RenderSettings) -> tuple[np.n
     """Straight RGBA [R, 4] and depth along the camera's axis [R]."""
     count = len(rays)
     # the colours of what was worth a look, and how much of the ray that was
-    colour, no_colour = torch.zeros(count, 4), torch.zeros(count, 3)
-    opacity = torch.zeros(count)
-    depth, left = torch.zeros(count), torch.ones(count)
+    colour, depth, left = torch.zeros(count, 4), torch.zeros(count), torch.ones(count)
     ops = kernels.select("cpu")
     jitter = torch.full((count,), 0.5)
     field, reach = scene.avatar.field, scene.avatar.config.reach
@@ -229,11 +227,8 @@ def _trace(scene: Scene, rays: RayBatch, settings: RenderSettings) -> tuple[np.n
             )
             sigma, inputs = field.geometry(samples, scene.worn)
             ray = alive[packed.ray.long()]
-            no_rgb = torch.zeros(len(packed), 3)
-            sums = left, no_colour, opacity, depth
-            weights = ops.marching.composite_step(
-                sigma, no_rgb, packed.t, settings.step, ray.int(), *sums
-            )
+            weights = ops.marching.weigh(sigma, settings.step, ray.int(), left)
+            depth.index_add_(0, ray, weights * packed.t)
             shown = (weights > settings.negligible * settings.step).nonzero()[:, 0]
             rgb = field.shade(inputs[shown], samples.direction, samples.ray[shown])
             weight = weights[shown, None]
@@ -241,6 +236,7 @@ def _trace(scene: Scene, rays: RayBatch, settings: RenderSettings) -> tuple[np.n
         first[alive] = wave.next
         going = (wave.next <= last[alive]) & (left[alive] > settings.transmittance)
         alive = alive[going]
+    opacity = 1 - left
     seen = (opacity > 1e-4) & (colour[:, 3] > 0)
     safe = torch.where(seen, opacity, 1.0)[:, None]
     straight = (colour[:, :3] / torch.where(seen, colour[:, 3], 1.0)[:, None]).clamp(0, 1)

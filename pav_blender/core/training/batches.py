@@ -73,9 +73,9 @@ class Poses:
         if known is None:
             mesh = self._deformer.pose(frame.vertices)
             meshes = self._canonical, frame.vertices, self._weights
-            known = _Posed(
-                mesh, head_rotation(*meshes), head_turn(*meshes), shell(mesh, space, reach), version
-            )
+            rotation = head_rotation(*meshes)
+            turn = head_turn(*meshes, rotation)
+            known = _Posed(mesh, rotation, turn, shell(mesh, space, reach), version)
             self._kept[frame.name] = known
             if len(self._kept) > _KEPT_POSES:
                 self._kept.popitem(last=False)

@@ -83,22 +83,6 @@ def _outline(frame: Frame, triangles: np.ndarray, seen: np.ndarray) -> None:
         np.maximum.at(seen, triangles[triangle[foot], corner], metres.astype(np.float32))
 
 
-def close_to(
-    canonical: np.ndarray,
-    triangles: np.ndarray,
-    box_min: np.ndarray,
-    box_size: float,
-    cells: int,
-    distance: float,
-) -> np.ndarray:
-    """Cells [G, G, G] bool whose centre is within `distance` metres of the canonical mesh."""
-    centres = _centres(cells, box_min, box_size)
-    reach = np.full(len(canonical), distance, np.float32)
-    near = np.zeros(cells**3, bool)
-    near[_band(canonical, triangles, centres, reach).row] = True
-    return near.reshape((cells,) * 3)
-
-
 def _centres(cells: int, box_min: np.ndarray, box_size: float) -> np.ndarray:
     grid = np.indices((cells,) * 3).reshape(3, -1).T
     return ((grid + 0.5) * (box_size / cells) + box_min).astype(np.float32)

@@ -21,44 +21,40 @@ _SEEN = 0.1  # transmittance from which a look at a cell counts
 _LOOKS = 8.0  # looks after which a cell is judged
 _BLOCK_LOOKS = 16.0  # the same for eight cells together
 _LEAST_WEIGHT = 2e-3  # a millimetre; untrained fog has about twice that
+_UNSEEN_REACH = 0.015  # metres from the mesh within which cells that no ray saw are kept
 _HIDDEN = 12  # rounds without a look after which a cell counts as hidden
 
 
-def first_guide(avatar: Avatar, deformer: Deformer) -> torch.Tensor:
-    """The density [A, G, G, G] (1/m) of an untrained field in each cell."""
+def mesh_distance(avatar: Avatar, deformer: Deformer) -> torch.Tensor:
+    """Metres [G, G, G] from the middle of each cell to the canonical mesh."""
     size = avatar.occupied.shape[1]
     side = avatar.box_size / size
     centres = torch.cartesian_prod(*[(torch.arange(size) + 0.5) * side] * 3)
     centres += torch.from_numpy(np.asarray(avatar.box_min, np.float32))
     distance = deformer.nearest(deformer.pose(avatar.canonical_vertices), centres)[2]
-    density = torch.exp(avatar.field.untrained(distance)) * 1e3
-    return density.view(1, size, size, size).repeat(len(avatar.occupied), 1, 1, 1)
+    return distance.view(size, size, size)
 
 
 class Visibility:
     """What was seen of each cell since it was last judged, over all appearances.
 
-    occupied [A, G, G, G] bool is changed in place; near [G, G, G] bool: close to the mesh.
-    guide [A, G, G, G] float32: the density (1/m) that the field had of late in each cell.
-    version counts how often much was emptied.
+    The avatar's `occupied` [A, G, G, G] is changed in place. guide [A, G, G, G] float32: the
+    density (1/m) that the field had of late in each cell. version counts how often much was
+    emptied.
     """
 
-    def __init__(
-        self,
-        occupied: np.ndarray,
-        near: np.ndarray,
-        guide: torch.Tensor,
-        box_min: np.ndarray,
-        box_size: float,
-    ) -> None:
+    def __init__(self, avatar: Avatar, deformer: Deformer) -> None:
+        occupied = avatar.occupied
         self.occupied = occupied
-        self._near = near
-        self._box = box_min, box_size
+        self._box = avatar.box_min, avatar.box_size
+        distance = mesh_distance(avatar, deformer)
+        self._near = (distance <= _UNSEEN_REACH).numpy()
+        density = torch.exp(avatar.field.untrained(distance)) * 1e3
+        self.guide = density.repeat(len(occupied), 1, 1, 1)
         self.weight = torch.zeros(occupied.size)
         self.looks = torch.zeros(occupied.size)
         self.filled = torch.ones(occupied.size, dtype=torch.bool)
         self.unseen = torch.zeros(occupied.size, dtype=torch.uint8)
-        self.guide = guide
         self.spaces: list[Clearance] = []
         self.version = 0
         self._marked = 1.0

@@ -14,10 +14,9 @@ from ..config import Config
 from ..deformation import Deformer
 from ..field.avatar import Avatar
 from .batches import Poses, draw_pixels, pick_samples
-from .carving import close_to
 from .frames import Frame, halved
 from .losses import Loss, losses
-from .occupancy import Visibility, first_guide
+from .occupancy import Visibility
 
 _FIRST_STEP = 8.0  # the first samples are this many times as far apart as the last
 _LOOKS_A_RAY = 24  # the step is as fine as this many looks a ray allow
@@ -25,7 +24,6 @@ _SAMPLES = 1 << 14  # samples a batch, by the number of its rays
 _CARVED = 0.5  # part of the schedule in which space is emptied often
 _PRUNE_EVERY = 40  # iterations, while there is much to empty
 _PRUNE_LATER = 200
-_UNSEEN_REACH = 0.015  # metres from the mesh within which cells that no ray saw are kept
 _WARM_UP = 20
 # parts of the schedule until which pictures are a half and a quarter as large: there are more
 # pixels than an avatar's minutes have rays, and small ones tell the most each
@@ -56,23 +54,13 @@ class Trainer:
         self, avatar: Avatar, frames: list[Frame], *, minutes: float | None = None
     ) -> None:
         self.avatar = avatar
-        self.frames = frames
         self.minutes = minutes
         self.config: Config = avatar.config
         self.status = Status(step=_FIRST_STEP * self.config.step, rays=self.config.rays // 8)
         self.random = np.random.default_rng(self.config.seed)
         self.generator = torch.Generator().manual_seed(self.config.seed)
-        box = avatar.box_min, avatar.box_size
-        near = close_to(
-            avatar.canonical_vertices,
-            avatar.triangles,
-            *box,
-            self.config.occupancy_resolution,
-            _UNSEEN_REACH,
-        )
         deformer = Deformer(avatar.canonical_vertices, avatar.triangles, self.config.frames)
-        guide = first_guide(avatar, deformer)
-        self.visibility = Visibility(avatar.occupied, near, guide, *box)
+        self.visibility = Visibility(avatar, deformer)
         self._poses = Poses(deformer, avatar.canonical_vertices, avatar.rigid_weights)
         self._pyramid = [_by_appearance(frames, len(avatar.appearances))]
         for _ in _COARSE:
@@ -116,7 +104,7 @@ class Trainer:
         if torch.isfinite(loss.total):
             loss.total.backward()
             self._adam(picked.samples.canonical, encoded)
-        self.visibility.watch(picked.cells, sigma.detach(), weights.detach(), picked.width)
+            self.visibility.watch(picked.cells, sigma.detach(), weights.detach(), picked.width)
         status.iteration += 1
         if self._prunes_now():
             status.filled = self.visibility.prune()

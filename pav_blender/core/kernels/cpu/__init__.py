@@ -13,7 +13,6 @@ import os
 import shutil
 import sys
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -87,19 +86,3 @@ def __getattr__(name: str) -> Any:
     if name in (*MODULES, "threads"):
         return importlib.import_module(f"{__name__}.{name}")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
-
-def warm_up(message: Callable[[str], None] | None = None) -> None:
-    """Compile (or load from disk) what rendering needs, so that the first frame does not wait.
-
-    Each kernel module that offers `warm_up()` is called in turn; `message` receives one line
-    before each. About half a minute on a cold cache, well under a second on a warm one.
-    """
-    for name in MODULES:
-        module = importlib.import_module(f"{__name__}.{name}")
-        prepare = getattr(module, "warm_up", None)
-        if prepare is None:
-            continue
-        if message is not None:
-            message(f"Preparing the {name} kernels")
-        prepare()

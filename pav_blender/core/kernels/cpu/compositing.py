@@ -32,31 +32,33 @@ def _offsets(ray_index, rays):
 
 
 @njit(**OPTIONS)
-def _forward(
-    start, stop, offsets, sigma, rgb, t, delta, transmittance, colour, opacity, depth, weights
-):
-    """Adds to colour, opacity and depth, lowers transmittance."""
+def _weigh(start, stop, offsets, sigma, delta, transmittance, weights):
+    """Writes the weights of the rays' samples and lowers what the rays have left."""
     one_delta = len(delta) == 1
     for ray in range(start, stop):
         left = np.float64(transmittance[ray])
-        red = green = blue = alpha = far = 0.0
         for i in range(offsets[ray], offsets[ray + 1]):
             optical = np.float64(sigma[i]) * delta[0 if one_delta else i]
-            passed = np.exp(-optical)
-            weight = -left * np.expm1(-optical)
-            left *= passed
-            weights[i] = weight
+            weights[i] = -left * np.expm1(-optical)
+            left *= np.exp(-optical)
+        transmittance[ray] = left
+
+
+@njit(**OPTIONS)
+def _forward(start, stop, offsets, sigma, rgb, t, delta, left, colour, opacity, depth, weights):
+    _weigh(start, stop, offsets, sigma, delta, left, weights)
+    for ray in range(start, stop):
+        red = green = blue = alpha = far = 0.0
+        for i in range(offsets[ray], offsets[ray + 1]):
+            weight = np.float64(weights[i])
             red += weight * rgb[i, 0]
             green += weight * rgb[i, 1]
             blue += weight * rgb[i, 2]
             alpha += weight
             far += weight * t[i]
-        transmittance[ray] = left
-        colour[ray, 0] += red
-        colour[ray, 1] += green
-        colour[ray, 2] += blue
-        opacity[ray] += alpha
-        depth[ray] += far
+        colour[ray, 0], colour[ray, 1], colour[ray, 2] = red, green, blue
+        opacity[ray] = alpha
+        depth[ray] = far
 
 
 @njit(**OPTIONS)
@@ -197,37 +199,29 @@ def composite(
     return _Composite.apply(sigma, rgb, t, delta, ray_index, rays)
 
 
-def composite_step(
+def weigh(
     sigma: torch.Tensor,
-    rgb: torch.Tensor,
-    t: torch.Tensor,
     delta: float | torch.Tensor,
     ray_index: torch.Tensor,
     transmittance: torch.Tensor,
-    colour: torch.Tensor,
-    opacity: torch.Tensor,
-    depth: torch.Tensor,
 ) -> torch.Tensor:
-    """One wave of `composite`: adds to colour [R,3], opacity [R], depth [R] in place.
+    """The weights [N] that `composite` gives one wave of samples.
 
-    `transmittance` [R] is what the rays have left and is lowered in place. Returns weights [N].
-    Not differentiable. The four must be contiguous float32.
+    `transmittance` [R] is what the rays have left and is lowered in place; it must be contiguous
+    float32. Not differentiable.
     """
+    if not transmittance.is_contiguous() or transmittance.dtype != torch.float32:
+        raise ValueError("weigh changes transmittance in place: contiguous float32")
     weights = torch.empty(len(sigma))
-    totals = (transmittance, colour, opacity, depth)
-    if not all(x.is_contiguous() and x.dtype == torch.float32 for x in totals):
-        raise ValueError("composite_step adds in place: it needs contiguous float32 tensors")
     rays = len(transmittance)
     run_chunks(
-        _forward,
+        _weigh,
         rays,
         _CHUNK,
         _starts(ray_index, rays),
         _array(sigma),
-        _array(rgb),
-        _array(t),
         _widths(delta, len(sigma)),
-        *(x.numpy() for x in totals),
+        transmittance.numpy(),
         weights.numpy(),
     )
     return weights

@@ -36,8 +36,6 @@ __all__ = [
     "read_vertices_backward_into",
     "resolutions",
     "table_sizes",
-    "texels_read",
-    "warm_up",
 ]
 
 CHUNK = 4096  # samples of a latent read handed to a thread at a time
@@ -45,20 +43,7 @@ CHUNK = 4096  # samples of a latent read handed to a thread at a time
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 
 
-def warm_up() -> None:
-    """Compile what rendering needs; see the package's `warm_up`."""
-    layout = Layout(levels=2, log2_entries=3, base=1, finest=2)  # one level dense, one hashed
-    point, index = torch.zeros(1, 3), torch.zeros(1, dtype=torch.int32)
-    with torch.inference_mode():
-        encode(point, torch.zeros(layout.entries, FEATURES), layout)
-        read_texture(torch.zeros(1, 1, 1, 1), index, point[:, :2])
-        triangles = torch.zeros(1, 3, dtype=torch.int32)
-        read_vertices(torch.zeros(1, 1, 1), index, triangles, index, point)
-
-
-def encode(
-    points: Tensor, tables: Tensor, layout: Layout, grad_into: Tensor | None = None
-) -> Tensor:
+def encode(points: Tensor, tables: Tensor, layout: Layout) -> Tensor:
     """As the reference, in float32; the gradient goes to the tables only.
 
     The result [N, levels * 2] lies in memory feature by feature (its strides are 1 and N): levels
@@ -66,7 +51,7 @@ def encode(
     """
     check_encode(points, tables, layout)
     _refuse_gradient("encode", "points", points)
-    return _Encode.apply(points, tables, layout, grad_into)
+    return _Encode.apply(points, tables, layout)
 
 
 def encode_backward_into(
@@ -105,23 +90,20 @@ def encode_adam_step(
 
 class _Encode(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx: Any, points: Tensor, tables: Tensor, layout: Layout, into: Tensor | None
-    ) -> Tensor:
+    def forward(ctx: Any, points: Tensor, tables: Tensor, layout: Layout) -> Tensor:
         ctx.save_for_backward(points)
-        ctx.layout, ctx.into = layout, into
+        ctx.layout = layout
         out = torch.empty(layout.width, len(points))
         arrays = _array(points), _array(tables).reshape(-1), out.view(-1).numpy()
         _run_levels(_encode_levels, len(points), layout, *arrays, _level_array(layout))
         return out.t()
 
     @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[None, Tensor | None, None, None]:
+    def backward(ctx: Any, *grads: Tensor) -> tuple[None, Tensor, None]:
         (points,) = ctx.saved_tensors
-        shape = (ctx.layout.entries, FEATURES)
-        target, answer = _target(ctx.into, shape)
-        encode_backward_into(points, grads[0], target, ctx.layout)
-        return None, answer, None, None
+        grad = torch.zeros(ctx.layout.entries, FEATURES)
+        encode_backward_into(points, grads[0], grad, ctx.layout)
+        return None, grad, None
 
 
 def _run_levels(kernel: Callable[..., Any], count: int, layout: Layout, *arrays: Any) -> None:
@@ -210,13 +192,11 @@ def _adam_levels(first, end, points, grad_out, table, m, v, settings, sizes, lev
         adam_range(0, high - low, table[low:high], grad, m[low:high], v[low:high], settings, False)
 
 
-def read_texture(
-    latent: Tensor, appearance: Tensor, uv: Tensor, grad_into: Tensor | None = None
-) -> Tensor:
+def read_texture(latent: Tensor, appearance: Tensor, uv: Tensor) -> Tensor:
     """As the reference, in float32; the gradient goes to the textures only."""
     check_texture(latent, appearance, uv)
     _refuse_gradient("read_texture", "uv", uv)
-    return _ReadTexture.apply(latent, appearance, uv, grad_into)
+    return _ReadTexture.apply(latent, appearance, uv)
 
 
 def read_texture_backward_into(
@@ -230,22 +210,11 @@ def read_texture_backward_into(
     _run_parts(_add_texels, size, width, *places, _array(grad_out).reshape(-1), flat)
 
 
-def texels_read(shape: tuple[int, ...], appearance: Tensor, uv: Tensor) -> Tensor:
-    """As the reference: rows of a latent texture [A,S,S,C], as [A*S*S,C], that a read touches."""
-    seen = np.zeros(shape[0] * shape[1] * shape[2], np.bool_)
-    places = _array(appearance, torch.int32), _array(uv)
-    # Threads may mark one texel at once, with the same mark.
-    run_chunks(_mark_texels, len(uv), CHUNK, shape[1], *places, seen)
-    return torch.from_numpy(np.flatnonzero(seen))
-
-
 class _ReadTexture(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx: Any, latent: Tensor, appearance: Tensor, uv: Tensor, into: Tensor | None
-    ) -> Tensor:
+    def forward(ctx: Any, latent: Tensor, appearance: Tensor, uv: Tensor) -> Tensor:
         ctx.save_for_backward(appearance, uv)
-        ctx.shape, ctx.into = latent.shape, into
+        ctx.shape = latent.shape
         size, width = latent.shape[2:]
         out = torch.empty(len(uv), width)
         arrays = _array(latent).reshape(-1), _array(appearance, torch.int32), _array(uv)
@@ -253,11 +222,11 @@ class _ReadTexture(torch.autograd.Function):
         return out
 
     @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, None, None, None]:
-        target, answer = _target(ctx.into, ctx.shape)
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None]:
+        grad = torch.zeros(ctx.shape)
         appearance, uv = ctx.saved_tensors
-        read_texture_backward_into(appearance, uv, grads[0], target)
-        return answer, None, None, None
+        read_texture_backward_into(appearance, uv, grads[0], grad)
+        return grad, None, None
 
 
 @njit(cache=True, nogil=True)
@@ -283,30 +252,17 @@ def _add_texels(first, end, parts, size, width, appearance, uv, grad_out, grad_l
             )
 
 
-@njit(cache=True, nogil=True)
-def _mark_texels(start, stop, size, appearance, uv, seen):
-    index = np.zeros(4 * rows.STRIDE, np.int64)
-    weight = np.zeros(4 * rows.STRIDE, np.float32)
-    for begin in range(start, stop, rows.BLOCK):
-        count = min(rows.BLOCK, stop - begin)
-        rows.locate_texels(size, appearance, uv, begin, count, index, weight)
-        for corner in range(4):
-            for i in range(count):
-                seen[index[corner * rows.STRIDE + i]] = True
-
-
 def read_vertices(
     latent: Tensor,
     appearance: Tensor,
     triangles: Tensor,
     triangle: Tensor,
     barycentric: Tensor,
-    grad_into: Tensor | None = None,
 ) -> Tensor:
     """As the reference, in float32; the gradient goes to the features only."""
     check_vertices(latent, appearance, triangles, triangle, barycentric)
     _refuse_gradient("read_vertices", "barycentrics", barycentric)
-    return _ReadVertices.apply(latent, appearance, triangles, triangle, barycentric, grad_into)
+    return _ReadVertices.apply(latent, appearance, triangles, triangle, barycentric)
 
 
 def read_vertices_backward_into(
@@ -334,10 +290,9 @@ class _ReadVertices(torch.autograd.Function):
         triangles: Tensor,
         triangle: Tensor,
         barycentric: Tensor,
-        into: Tensor | None,
     ) -> Tensor:
         ctx.save_for_backward(appearance, triangles, triangle, barycentric)
-        ctx.shape, ctx.into = latent.shape, into
+        ctx.shape = latent.shape
         vertices, width = latent.shape[1:]
         out = torch.empty(len(barycentric), width)
         arrays = (
@@ -349,11 +304,11 @@ class _ReadVertices(torch.autograd.Function):
         return out
 
     @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, None, None, None, None, None]:
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None, None, None]:
+        grad = torch.zeros(ctx.shape)
         appearance, triangles, triangle, barycentric = ctx.saved_tensors
-        target, answer = _target(ctx.into, ctx.shape)
-        read_vertices_backward_into(appearance, triangles, triangle, barycentric, grads[0], target)
-        return answer, None, None, None, None, None
+        read_vertices_backward_into(appearance, triangles, triangle, barycentric, grads[0], grad)
+        return grad, None, None, None, None
 
 
 def _mesh_arrays(
@@ -397,14 +352,6 @@ def _run_parts(kernel: Callable[..., Any], *arrays: Any) -> None:
     """Rows of a table are shared out between threads, in a power of two of parts."""
     parts = 1 << (threads().bit_length() - 1)
     run_chunks(kernel, parts, 1, parts, *arrays)
-
-
-def _target(into: Tensor | None, shape: Any) -> tuple[Tensor, Tensor | None]:
-    """What to add a gradient to, and what to tell autograd: nothing where it has a place."""
-    if into is not None:
-        return into, None
-    fresh = torch.zeros(shape)
-    return fresh, fresh
 
 
 def _refuse_gradient(function: str, name: str, tensor: Tensor) -> None:

@@ -15,7 +15,7 @@ from numba import njit
 
 from ..reference.marching import bounds, lattice
 from ..structures import Clearance, PosedMesh, Wave
-from .compositing import composite, composite_step
+from .compositing import composite, weigh
 from .lanes import (
     LANES,
     bits,
@@ -35,7 +35,7 @@ from .nearest import settle
 from .search import INLINE, OPTIONS, STACK, foot, search
 from .threads import run_chunks
 
-__all__ = ["bounds", "canonicalise", "composite", "composite_step", "lattice", "march"]
+__all__ = ["bounds", "canonicalise", "composite", "lattice", "march", "weigh"]
 
 _CHUNK = 256  # rays a thread takes at a time: a multiple of LANES
 # Of a clear distance in canonical space, what a step in posed space may use: the maps stretch.

@@ -44,13 +44,6 @@ def mlp(
     return _Mlp.apply(x, group_bias, group, *weights, *biases)
 
 
-def warm_up() -> None:
-    """Compile what rendering needs; see the package's `warm_up`."""
-    with torch.inference_mode():
-        weight, bias, group = torch.ones(1, 1), torch.zeros(1), torch.zeros(1, dtype=torch.int32)
-        mlp(torch.ones(1, 1), [weight, weight], [bias, bias], weight, group)
-
-
 @dataclass(frozen=True)
 class Gradients:
     """What `mlp_backward` returns; x only where it was asked for, laid out as the input was."""

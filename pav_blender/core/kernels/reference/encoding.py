@@ -7,7 +7,6 @@ whose corners index a table of features, directly where the grid fits, by a spat
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -79,17 +78,13 @@ class Layout:
         return self.levels * FEATURES
 
 
-def encode(
-    points: Tensor, tables: Tensor, layout: Layout, grad_into: Tensor | None = None
-) -> Tensor:
+def encode(points: Tensor, tables: Tensor, layout: Layout) -> Tensor:
     """Encode points [N,3] with tables [layout.entries, 2] -> [N, levels * 2].
 
     Points are clamped into the unit cube; a coordinate that is not a number counts as 0.
-    Differentiable in points and tables. The tables' gradient is added to grad_into, if that is
-    given, and not returned: a training loop that keeps gradients saves an array of their size.
+    Differentiable in points and tables.
     """
     check_encode(points, tables, layout)
-    tables = _redirect(tables, grad_into)
     points = torch.nan_to_num(points, nan=0.0).clamp(0, 1)
     parts = []
     for res, offset, size, hashed in zip(
@@ -160,33 +155,19 @@ def encode_adam_step(
     )
 
 
-def read_texture(
-    latent: Tensor, appearance: Tensor, uv: Tensor, grad_into: Tensor | None = None
-) -> Tensor:
+def read_texture(latent: Tensor, appearance: Tensor, uv: Tensor) -> Tensor:
     """Read latent textures [A,S,S,C] bilinearly at uv [N,2] of appearance [N] -> [N,C].
 
     Texel (row, column) has its centre at v = (row + 0.5) / S, u = (column + 0.5) / S: row 0 is at
     v = 0, below. Reads beyond the outermost centres give the outermost texel. Differentiable in
-    both; for grad_into see `encode`.
+    both.
     """
     check_texture(latent, appearance, uv)
-    latent = _redirect(latent, grad_into)
     (row, column, below, right), (fu, fv) = _texels(latent.shape[1], uv)
     which = appearance.long()
     first = latent[which, row, column] * (1 - fu) + latent[which, row, right] * fu
     second = latent[which, below, column] * (1 - fu) + latent[which, below, right] * fu
     return first * (1 - fv) + second * fv
-
-
-def texels_read(shape: tuple[int, ...], appearance: Tensor, uv: Tensor) -> Tensor:
-    """Rows of a latent texture of shape [A,S,S,...], taken as [A*S*S,...], that a read touches.
-
-    Ascending, without repeats, int64: the rows for `sparse_adam_step` after `read_texture`.
-    """
-    (row, column, below, right), _ = _texels(shape[1], uv)
-    pairs = [(row, column), (row, right), (below, column), (below, right)]
-    texels = [(appearance.long() * shape[1] + v) * shape[2] + u for v, u in pairs]
-    return torch.cat(texels).unique()
 
 
 def _texels(size: int, uv: Tensor) -> tuple[tuple[Tensor, ...], tuple[Tensor, Tensor]]:
@@ -216,16 +197,13 @@ def read_vertices(
     triangles: Tensor,
     triangle: Tensor,
     barycentric: Tensor,
-    grad_into: Tensor | None = None,
 ) -> Tensor:
     """Read features of vertices [A,V,C] at points of a mesh -> [N,C].
 
     triangles [T,3] holds the vertices of every triangle; triangle [N] and barycentric [N,3] say
-    where on the mesh each point lies. Differentiable in the features and the barycentrics; for
-    grad_into see `encode`.
+    where on the mesh each point lies. Differentiable in the features and the barycentrics.
     """
     check_vertices(latent, appearance, triangles, triangle, barycentric)
-    latent = _redirect(latent, grad_into)
     corners = triangles.long()[triangle.long()]
     features = latent[appearance.long()[:, None], corners]
     return (features * barycentric.unsqueeze(2)).sum(1)
@@ -245,23 +223,6 @@ def read_vertices_backward_into(
         out = read_vertices(latent, appearance, triangles, triangle, barycentric.detach())
     (grad,) = torch.autograd.grad(out, latent, grad_out)
     grad_latent += grad
-
-
-class _Redirect(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, tensor: Tensor, into: Tensor) -> Tensor:
-        ctx.into = into
-        return tensor.view_as(tensor)
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[None, None]:
-        ctx.into += grads[0]
-        return None, None
-
-
-def _redirect(tensor: Tensor, into: Tensor | None) -> Tensor:
-    """The tensor, whose gradient from here on is added to `into` instead of being returned."""
-    return tensor if into is None else _Redirect.apply(tensor, into)
 
 
 def check_encode(points: Tensor, tables: Tensor, layout: Layout) -> None:

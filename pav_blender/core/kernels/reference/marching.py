@@ -176,27 +176,17 @@ def composite(
     return sums[:, :3], sums[:, 3], sums[:, 4], weights
 
 
-def composite_step(
+def weigh(
     sigma: torch.Tensor,
-    rgb: torch.Tensor,
-    t: torch.Tensor,
     delta: float | torch.Tensor,
     ray_index: torch.Tensor,
     transmittance: torch.Tensor,
-    colour: torch.Tensor,
-    opacity: torch.Tensor,
-    depth: torch.Tensor,
 ) -> torch.Tensor:
-    """One wave of `composite`: adds to colour [R,3], opacity [R], depth [R] in place.
+    """The weights [N] that `composite` gives one wave of samples.
 
-    `transmittance` [R] is what the rays have left and is lowered in place. Returns weights [N].
-    Not differentiable.
+    `transmittance` [R] is what the rays have left and is lowered in place. Not differentiable.
     """
     with torch.no_grad():
         weights, left = _weights(sigma, delta, ray_index, transmittance)
-        index = ray_index.long()
-        colour.index_add_(0, index, weights[:, None] * rgb)
-        opacity.index_add_(0, index, weights)
-        depth.index_add_(0, index, weights * t)
         transmittance.copy_(left)
     return weights
