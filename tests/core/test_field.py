@@ -10,10 +10,15 @@ from pav_blender.core.config import APPEARANCE_MODES, Config
 from pav_blender.core.errors import InputError
 from pav_blender.core.field.avatar import Avatar, read_header
 from pav_blender.core.field.directions import spherical_harmonics
-from pav_blender.core.field.field import Field, Samples
+from pav_blender.core.field.field import Field, Samples, condition
 
 TINY = Config(
-    levels=4, log2_entries=10, finest_resolution=64, latent_size=8, occupancy_resolution=8
+    levels=4,
+    log2_entries=10,
+    finest_resolution=64,
+    latent_size=8,
+    occupancy_resolution=8,
+    sees_expression=True,
 )
 
 
@@ -118,6 +123,24 @@ def test_expression_and_direction_enter_as_the_first_layers_inputs():
             plain = torch.relu(plain @ w.T + b)
         plain = plain @ field.density.weights[-1].T + field.density.biases[-1]
     torch.testing.assert_close(folded, plain, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("expression", [False, True])
+@pytest.mark.parametrize("turn", [False, True])
+def test_a_field_sees_of_a_frame_what_its_settings_say(expression, turn):
+    config = dataclasses.replace(TINY, sees_expression=expression, sees_turn=turn)
+    field = make_field(config)
+    moved = [
+        condition(config, np.full(5, smile, np.float32), np.full(3, turned, np.float32))
+        for smile, turned in ((0.1, 0.1), (0.9, 0.1), (0.1, 0.9))
+    ]
+    with torch.no_grad():
+        still, smiling, turning = (
+            field(dataclasses.replace(make_samples(), condition=torch.stack([c, c])))[0]
+            for c in moved
+        )
+    assert torch.equal(still, smiling) != expression
+    assert torch.equal(still, turning) != turn
 
 
 def test_density_alone_is_the_density_of_the_whole():

@@ -19,7 +19,7 @@ from ..files import replacing
 from .field import Field
 
 FORMAT = "pav-avatar"
-VERSION = 1
+VERSION = 2
 _LARGEST_HEADER = 100 << 20
 
 

@@ -56,10 +56,10 @@ TURN = 3
 def condition(
     config: Config, expression: np.ndarray | torch.Tensor, turn: np.ndarray
 ) -> torch.Tensor:
-    """What the density depends on besides the place, [E + 3 or E]: the expression [E] and the
-    head's turn [3] (`deformation.rigid.head_turn`)."""
-    values = torch.as_tensor(expression).float()
-    return torch.cat([values, torch.from_numpy(turn)]) if config.sees_turn else values
+    """What the density depends on besides the place: of the expression [E] and the head's turn [3]
+    (`deformation.rigid.head_turn`) what the settings let it see."""
+    seen = torch.as_tensor(expression).float() if config.sees_expression else torch.empty(0)
+    return torch.cat([seen, torch.from_numpy(turn)]) if config.sees_turn else seen
 
 
 @dataclass
@@ -142,7 +142,7 @@ class Field(nn.Module):
         codes = config.latent_channels if config.appearance_code and mapped else 0
         self.code = nn.Parameter(torch.randn(appearances, codes) * 0.5)
         embedding, geometry = config.embedding_channels, config.geometry_channels
-        conditions = expressions + (TURN if config.sees_turn else 0)
+        conditions = config.sees_expression * expressions + config.sees_turn * TURN
         self.density = Mlp(
             self.layout.width, conditions, config.hidden, config.density_layers, geometry
         )
