@@ -1,8 +1,10 @@
-"""Which samples training takes: every place is stood for, and the kernels agree."""
+"""Which samples are taken of a ray: every place is stood for, and the kernels agree."""
 
 from __future__ import annotations
 
-import numpy as np
+import dataclasses
+import math
+
 import pytest
 import torch
 from hypothesis import given, settings
@@ -10,24 +12,44 @@ from hypothesis import strategies as st
 from test_marching import CANONICAL, POSED, STEP, TRIANGLES, emitted, rays, run
 from test_marching import shell as ball
 
-from pav_blender.core.deformation import Deformer, box, shell
+from pav_blender.core.deformation import Clearance, Deformer, Thrift, voxels
 from pav_blender.core.kernels import select
 from pav_blender.core.kernels.reference import picking as reference
 
 CPU = select("cpu").picking
+BAND = 0.03
+ALL = Thrift(width=200)  # every place is a sample
 
 
-def pick(kernels, guide: torch.Tensor, count: int = 48, step: float = STEP):
-    plain = kernels is reference
-    mesh = Deformer(CANONICAL, TRIANGLES, "smooth", reference=plain).pose(POSED)
-    marching = select("cpu", reference=plain).marching
+def posed(plain: bool = False, mode: str = "smooth"):
+    return Deformer(CANONICAL, TRIANGLES, mode, reference=plain).pose(POSED)
+
+
+def ranges(box: torch.Tensor, count: int, step: float):
     origins, directions, jitter = rays(count)
-    near, far = marching.bounds(mesh.vertices, 0.03, origins, directions)
-    first, last = marching.lattice(near, far, jitter, step)
-    chance = torch.rand(count, generator=torch.Generator().manual_seed(1))
-    options = {"clearance": ball(), "guide": guide, "band": 0.03, "leap_limit": 0.0}
-    args = mesh, origins, directions, first, last, jitter
-    return kernels.pick(*args, chance, step, **options)
+    marching = select("cpu").marching
+    near, far = marching.bounds(box, 0.0, origins, directions)
+    return origins, directions, *marching.lattice(near, far, jitter, step), jitter
+
+
+def pick(
+    kernels,
+    guide: torch.Tensor,
+    thrift: Thrift = ALL,
+    space: Clearance | None = None,
+    step: float = STEP,
+    first: torch.Tensor | None = None,
+    mode: str = "smooth",
+):
+    space = ball() if space is None else space
+    found = voxels(posed(mode=mode), space, BAND)
+    origins, directions, start, last, jitter = ranges(found.box, 48, step)
+    chance = torch.rand(48, generator=torch.Generator().manual_seed(1))
+    return kernels.pick(
+        posed(kernels is reference, mode), found, guide, origins, directions,
+        start if first is None else first, last, jitter, chance, torch.ones(48), step,
+        clearance=space, band=BAND, thrift=thrift,
+    )  # fmt: skip
 
 
 def guide_of(kind: str) -> torch.Tensor:
@@ -36,44 +58,90 @@ def guide_of(kind: str) -> torch.Tensor:
     if kind == "empty":
         return empty
     if kind == "solid":
-        return torch.full((size,) * 3, 1e4)
+        return torch.where(ball().grid == 0, 1e4, 1e-3)
     noise = torch.rand((size,) * 3, generator=torch.Generator().manual_seed(2))
     return torch.exp(10 * noise - 4)
 
 
+def used(picks) -> torch.Tensor:
+    return torch.arange(picks.k.shape[1]) < picks.count[:, None]
+
+
+def places(picks) -> set[tuple[int, int]]:
+    ray, slot = used(picks).nonzero().unbind(1)
+    return set(zip(ray.tolist(), picks.k[ray, slot].tolist(), strict=True))
+
+
+TRAINING = Thrift(width=48, share=0.05, longest=3, opaque=8.0)
+PICTURE = Thrift(width=6, share=0.02, longest=4, least=0.5)
+
+
 @pytest.mark.parametrize("kind", ["empty", "noisy", "solid"])
-def test_the_kernel_picks_what_the_reference_picks(kind):
-    got, want = (pick(kernels, guide_of(kind)) for kernels in (CPU, reference))
-    same = (got.count == want.count) & (got.looks == want.looks) & (got.ended == want.ended)
-    assert same.float().mean() > 0.9  # a sample on the edge of a cell may differ
-    used = torch.arange(got.k.shape[1]) < got.count[:, None]
-    alike = used & same[:, None]
+@pytest.mark.parametrize("thrift", [ALL, TRAINING, PICTURE])
+def test_the_kernel_picks_what_the_reference_picks(kind, thrift):
+    got, want = (pick(kernels, guide_of(kind), thrift) for kernels in (CPU, reference))
+    same = (got.count == want.count) & (got.looks == want.looks) & (got.next == want.next)
+    assert same.float().mean() > 0.9  # a place on the edge of a voxel may differ
+    alike = used(got) & same[:, None]
     for name in ("k", "steps"):
         equal = getattr(got, name) == getattr(want, name)
-        assert equal[alike].float().mean() > 0.97
+        assert equal[alike].float().mean() > 0.97 or not alike.any()
     both = alike & (got.k == want.k) & (got.triangle == want.triangle)
-    assert both.sum() > 20
+    assert both.sum() > 20 or thrift.least > guide_of(kind).max()
     torch.testing.assert_close(got.canonical[both], want.canonical[both], rtol=0, atol=2e-5)
+    torch.testing.assert_close(got.distance[both], want.distance[both], rtol=0, atol=2e-6)
+
+
+def everywhere() -> Clearance:
+    return dataclasses.replace(ball(), grid=torch.zeros_like(ball().grid))
 
 
 def test_samples_together_stand_for_every_place():
-    got = pick(CPU, guide_of("empty"))
-    used = torch.arange(got.k.shape[1]) < got.count[:, None]
-    assert torch.equal((got.steps * used).sum(1).int(), got.looks)
-    assert got.steps[used].max() == reference.LONGEST
-    assert not got.ended.any()
-    following = used[:, 1:]
-    assert torch.all((got.k[:, 1:] > got.k[:, :-1])[following])
+    got = pick(CPU, guide_of("empty"), TRAINING._replace(width=200), everywhere())
+    inside = got.distance[used(got)] < 0.9 * BAND  # at the band's edge samples are dropped
+    assert inside.float().mean() > 0.8
+    assert got.steps[used(got)].max() == TRAINING.longest
+    whole = pick(CPU, guide_of("empty"), ALL, everywhere())
+    assert torch.equal(whole.looks, got.looks)
+    dropped = got.looks - (got.steps * used(got)).sum(1)
+    assert torch.all(dropped >= 0)
+    assert dropped.sum() < 0.3 * got.looks.sum()
+    assert torch.all((got.k[:, 1:] > got.k[:, :-1])[used(got)[:, 1:]])
 
 
-def test_a_ray_ends_where_the_guide_is_opaque_and_says_so():
-    open_, solid = pick(CPU, guide_of("empty")), pick(CPU, guide_of("solid"))
-    hit = open_.looks > 2
+def test_a_ray_ends_where_a_trusted_guide_is_opaque_and_says_so():
+    space = ball()
+    last = ranges(voxels(posed(), space, BAND).box, 48, STEP)[3]
+    open_, solid = (pick(CPU, guide_of(kind), TRAINING) for kind in ("empty", "solid"))
+    hit = solid.next <= last
     assert hit.sum() > 10
     assert torch.all(solid.looks[hit] < open_.looks[hit])
-    assert torch.all(solid.ended[hit])
-    used = torch.arange(solid.k.shape[1]) < solid.count[:, None]
-    assert torch.all(solid.steps[used] == 1)  # a surface is not stepped over
+    assert torch.equal(solid.looks[~hit], open_.looks[~hit])
+    assert torch.all(open_.next > last)
+    final = solid.steps[hit, (solid.count[hit].long() - 1).clamp(min=0)]
+    assert (final <= 1).float().mean() > 0.9  # a surface is not stepped over, but for its fringe
+    untrusted = pick(CPU, guide_of("solid"), TRAINING._replace(opaque=math.inf))
+    assert torch.equal(untrusted.looks, open_.looks)
+
+
+def test_a_place_that_adds_too_little_is_passed_over():
+    guide = guide_of("noisy")
+    few, every = pick(CPU, guide, ALL._replace(least=1.0)), pick(CPU, guide)
+    assert places(few) < places(every)
+    assert 0.2 < len(places(few)) / len(places(every)) < 0.8
+    assert not places(pick(CPU, guide, ALL._replace(least=float(guide.max()) * 2)))
+
+
+def test_picking_continues_where_it_stopped():
+    guide, thrift = guide_of("noisy"), Thrift(width=3)
+    found, first = set(), None
+    for _ in range(40):
+        part = pick(CPU, guide, thrift, first=first)
+        assert first is None or torch.all(part.next >= first)
+        assert part.count.max() <= 3
+        found |= places(part)
+        first = part.next
+    assert found == places(pick(CPU, guide))
 
 
 @settings(max_examples=25, deadline=None)
@@ -90,31 +158,52 @@ def test_the_guide_follows_alike_and_stays_between(seen):
 
 
 @pytest.mark.parametrize("mode", ["affine", "smooth"])
-def test_a_shell_hides_next_to_nothing(mode):
-    mesh = Deformer(CANONICAL, TRIANGLES, mode).pose(POSED)
+def test_voxels_hide_next_to_nothing(mode):
     space = ball()
-    kernels = select("cpu").marching
-    options = {"band": 0.03, "clearance": space, "step": 0.001, "wave": 200, "leap_limit": 0.0}
-    want = emitted(run(kernels, mesh, **options))
-    got = emitted(run(kernels, mesh, **options, shell=shell(mesh, space, 0.03)))
+    options = {"band": BAND, "clearance": space, "step": 0.001, "wave": 400, "leap_limit": 0.0}
+    origins, directions, first, last, jitter = ranges(
+        voxels(posed(mode=mode), space, BAND).box, 48, 0.001
+    )
+    marched = select("cpu").marching.march(
+        posed(mode=mode), origins, directions, first, last, jitter, 0.001,
+        wave=400, band=BAND, clearance=space, leap_limit=0.0,
+    )  # fmt: skip
+    everything = emitted(run(select("cpu").marching, posed(mode=mode), **options))
+    want = emitted(marched)
+    assert want == everything  # nothing lies outside the voxels' box
+    got = places(pick(CPU, guide_of("empty"), Thrift(width=400), step=0.001, mode=mode))
     assert len(want) > 500
     assert got <= want
     assert len(want - got) <= 0.002 * len(want)
 
 
-def test_a_shell_is_tight_and_its_box_holds_it():
-    mesh = Deformer(CANONICAL, TRIANGLES, "smooth").pose(POSED)
-    found = shell(mesh, ball(), 0.05)
-    low, high = box(found)
-    assert torch.all(low < mesh.vertices.amin(0))
-    assert torch.all(high > mesh.vertices.amax(0))
+def test_voxels_are_tight_and_say_which_cell_they_are():
+    space = ball()
+    found = voxels(posed(), space, 0.05)
+    low, high = found.box
+    assert torch.all(low < posed().vertices.amin(0))
+    assert torch.all(high > posed().vertices.amax(0))
     assert (high - low).max() < 0.4
-    middle = ((torch.zeros(3) - low) / found.cell).long()
-    assert found.grid[tuple(middle.tolist())] > 0  # the ball is hollow
-    assert 0.05 < float((found.grid == 0).float().mean()) < 0.7
+    middle = ((torch.zeros(3) - low) * found.scale).long()
+    assert found.bricks[tuple(middle.tolist())] < 0  # the ball is hollow
+    filled = found.cells >= 0
+    assert 0.2 < filled.float().mean() < 1
+    near = space.grid.view(-1)[found.cells[filled].long()]
+    assert near.max() == 1
+    assert (near == 0).float().mean() > 0.4
 
 
-def test_nothing_occupied_makes_an_empty_shell():
-    mesh = Deformer(CANONICAL, TRIANGLES, "smooth").pose(POSED)
+def test_brick_cells_as_the_reference():
+    generator = torch.Generator().manual_seed(3)
+    middles = torch.rand((200, 3), generator=generator) * 0.4 - 0.2  # some outside the box
+    maps = torch.eye(3) + 0.3 * torch.randn((200, 3, 3), generator=generator)
+    got, want = (k.brick_cells(middles, maps, ball(), 0.003) for k in (CPU, reference))
+    assert (got == want).float().mean() > 0.999
+    assert 0.05 < (want >= 0).float().mean() < 0.9
+
+
+def test_where_nothing_is_occupied_nothing_is_picked():
     space = ball(thickness=-1.0)
-    assert np.all(shell(mesh, space, 0.03).grid.numpy() > 0)
+    assert len(voxels(posed(), space, BAND).cells) == 0
+    for kernels in (CPU, reference):
+        assert not places(pick(kernels, guide_of("empty"), ALL, space))

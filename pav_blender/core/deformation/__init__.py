@@ -1,21 +1,22 @@
 """From the posed mesh to the canonical one: triangle maps, the deformer, the clearance grid."""
 
 from ..kernels.reference.marching import canonicalise
-from ..kernels.structures import Clearance, PosedMesh, Wave
+from ..kernels.structures import Clearance, PosedMesh, Thrift, Voxels, Wave
 from .deformer import Deformer
 from .frames import triangle_maps, vertex_maps
 from .occupancy import clearance
-from .shells import box, shell
+from .voxels import voxels
 
 __all__ = [
     "Clearance",
     "Deformer",
     "PosedMesh",
+    "Thrift",
+    "Voxels",
     "Wave",
-    "box",
     "canonicalise",
     "clearance",
-    "shell",
     "triangle_maps",
     "vertex_maps",
+    "voxels",
 ]

@@ -48,6 +48,44 @@ class Clearance:
         return 1.0 / (self.box_scale * self.grid.shape[0])
 
 
+@dataclass(frozen=True, eq=False)
+class Voxels:
+    """Posed space in bricks of 4x4x4 voxels: where a pose may hold anything, and which canonical
+    cell that is, so that rays can be followed without a search.
+
+    `bricks[i, j, k]` is a row of `cells`, or where nothing can be minus the chessboard distance in
+    bricks to the nearest that has one. `cells` holds each voxel's canonical cell, a flat index into
+    the grid of a `Clearance`, or -1. A posed point x lies in brick `floor((x - box_min) * scale)`;
+    outside the box there is nothing.
+    """
+
+    bricks: torch.Tensor  # [N,N,N] int32
+    cells: torch.Tensor  # [B,4,4,4] int32
+    box_min: torch.Tensor  # [3] float32, metres
+    scale: float  # bricks a metre
+
+    @property
+    def box(self) -> torch.Tensor:
+        """The two opposite corners [2,3], for `bounds`."""
+        return torch.stack([self.box_min, self.box_min + len(self.bricks) / self.scale])
+
+
+class Thrift(NamedTuple):
+    """How few samples may stand for a ray's places; what a place adds is told by a guide.
+
+    width: samples at most; share: what places that go together may add to a pixel; longest: how
+    many they may be; opaque: the guide's optical depth at which a ray ends, or infinite where the
+    guide is not to hide anything; least: density (1/m) below which a
+    place is passed over.
+    """
+
+    width: int
+    share: float = 0.0
+    longest: int = 1
+    opaque: float = float("inf")
+    least: float = 0.0
+
+
 class Wave(NamedTuple):
     """Up to W occupied samples a ray; entries beyond `count` hold -1 (k, triangle) and zeros."""
 
@@ -63,13 +101,14 @@ class Wave(NamedTuple):
 class Picks(NamedTuple):
     """Samples [R, W] of which the first `count` [R] of a ray count.
 
-    k: lattice index; steps: how many steps of the lattice the sample stands for; looks [R]:
-    places looked at; ended [R] bool: there was more to look at; the rest as in a `Wave`.
+    looks [R]: places that were looked at; next [R]: lattice index to continue from, last + 1 when
+    finished; k: lattice index; steps: how many steps of the lattice the sample stands for; the rest
+    as in a `Wave`.
     """
 
     count: torch.Tensor  # type: ignore[assignment]
     looks: torch.Tensor
-    ended: torch.Tensor
+    next: torch.Tensor
     k: torch.Tensor
     steps: torch.Tensor
     triangle: torch.Tensor

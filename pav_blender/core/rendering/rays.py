@@ -12,6 +12,8 @@ from ..field.field import Samples
 from ..kernels.structures import Picks, Wave
 from .cameras import Camera
 
+TILE = 4  # rays go together in squares of pixels
+
 
 @dataclass(eq=False)
 class RayBatch:
@@ -37,6 +39,14 @@ def camera_rays(camera: Camera, columns: np.ndarray, rows: np.ndarray) -> RayBat
         torch.from_numpy(directions),
         torch.from_numpy(cosine),
     )
+
+
+def tiled(width: int, height: int) -> np.ndarray:
+    """Pixels [width * height] (row * width + column), tile after tile: neighbours search alike."""
+    pixels = np.arange(width * height)
+    row, column = pixels // width, pixels % width
+    tiles = (row // TILE * -(-width // TILE) + column // TILE) * TILE**2
+    return np.argsort(tiles + row % TILE * TILE + column % TILE)
 
 
 @dataclass(eq=False)

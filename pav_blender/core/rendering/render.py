@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import weakref
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -10,14 +11,16 @@ import numpy as np
 import torch
 
 from .. import kernels
-from ..deformation import Clearance, Deformer, PosedMesh, box, clearance, shell
+from ..deformation import Clearance, Deformer, PosedMesh, Thrift, Voxels, clearance, voxels
 from ..deformation.rigid import head_rotation, head_turn
 from ..errors import Cancelled, InputError
 from ..field.avatar import Avatar
 from ..field.field import Worn, condition
-from ..kernels.cpu.threads import torch_alone
+from ..kernels.cpu.threads import run_chunks, torch_alone
+from ..kernels.structures import Picks, Wave
 from .cameras import Camera
-from .rays import RayBatch, camera_rays, pack, samples_of
+from .guide import guide
+from .rays import RayBatch, camera_rays, pack, samples_of, tiled
 
 Appearance = str | Mapping[str, float]
 
@@ -26,23 +29,28 @@ Appearance = str | Mapping[str, float]
 class RenderSettings:
     """step: metres between samples; transmittance: a ray ends when less of it is left.
 
-    skip: leap over cells known to be empty; negligible: weight a metre below which a sample's
-    colour is not asked for; wave: samples a ray between two looks at its transmittance; chunk:
-    rays at once.
+    skip: pass over voxels known to be empty, and by what is known of the density in the others
+    (`guide`) over places of less than `least` (1/m), and take up to `longest` places together that
+    add no more than `share` to a pixel; negligible: weight a metre below which a sample's colour is
+    not asked for; wave: samples a ray between two looks at its transmittance; chunk: rays that
+    a thread takes at a time.
     """
 
     step: float = 1.5e-3
     transmittance: float = 1e-3
     skip: bool = True
+    least: float = 0.1
+    share: float = 0.02
+    longest: int = 4
     negligible: float = 0.05
-    wave: int = 12
-    chunk: int = 16_384
+    wave: int = 6
+    chunk: int = 1 << 15
 
     @classmethod
     def preset(cls, name: str) -> RenderSettings:
         """ "preview" (fast), "final", "reference" (every sample, to the end of the ray)."""
         presets = {
-            "preview": cls(step=2.5e-3, transmittance=1e-2),
+            "preview": cls(step=2.5e-3, transmittance=1e-2, least=1.0, share=0.05),
             "final": cls(),
             "reference": cls(step=3.9e-4, transmittance=0.0, skip=False, negligible=0.0, wave=64),
         }
@@ -66,7 +74,8 @@ class Scene:
     avatar: Avatar
     mesh: PosedMesh
     clearance: Clearance
-    shell: Clearance
+    voxels: Voxels
+    guide: torch.Tensor
     rotation: np.ndarray
     condition: torch.Tensor
     worn: Worn
@@ -76,6 +85,7 @@ _deformers: weakref.WeakKeyDictionary[Avatar, Deformer] = weakref.WeakKeyDiction
 _clearances: weakref.WeakKeyDictionary[Avatar, dict[tuple[int, ...], Clearance]] = (
     weakref.WeakKeyDictionary()
 )
+_guides: weakref.WeakKeyDictionary[Avatar, dict[int, torch.Tensor]] = weakref.WeakKeyDictionary()
 
 
 def deformer_of(avatar: Avatar) -> Deformer:
@@ -94,6 +104,19 @@ def space_of(avatar: Avatar, rows: tuple[int, ...]) -> Clearance:
         occupied = avatar.occupied[list(rows)].any(0)
         known[rows] = clearance_of(occupied, avatar.box_min, avatar.box_size)
     return known[rows]
+
+
+def guide_of(avatar: Avatar, weights: np.ndarray) -> torch.Tensor:
+    """The density (1/m) of each cell [G, G, G] where appearances are worn by weights [A]; that of
+    an appearance is computed once."""
+    known = _guides.setdefault(avatar, {})
+    total = torch.zeros(avatar.occupied.shape[1:])
+    for row in np.flatnonzero(weights):
+        if row not in known:
+            worn = avatar.field.blend(torch.eye(len(weights))[row])
+            known[row] = guide(avatar, deformer_of(avatar), worn, avatar.occupied[row])
+        total += float(weights[row]) * known[row]
+    return total
 
 
 def clearance_of(occupied: np.ndarray, box_min: np.ndarray, box_size: float) -> Clearance:
@@ -146,7 +169,8 @@ def pose_scene(
         avatar,
         mesh,
         space,
-        shell(mesh, space, avatar.config.reach),
+        voxels(mesh, space, avatar.config.reach),
+        guide_of(avatar, weights),
         rotation,
         condition(avatar.config, values.astype(np.float32), turn),
         avatar.field.blend(torch.from_numpy(weights)),
@@ -173,19 +197,31 @@ def render(
     settings = settings or RenderSettings()
     if region is not None:
         camera = camera.window(*region)
+    caller, done = threading.get_ident(), 0
     with torch.inference_mode(), torch_alone():
         scene = pose_scene(avatar, vertices, appearance, expression)
-        count = camera.width * camera.height
+        order = tiled(camera.width, camera.height)
+        count = len(order)
         rgba = np.zeros((count, 4), np.float32)
         depth = np.full(count, np.inf, np.float32)
-        for start in range(0, count, settings.chunk):
-            if should_stop is not None and should_stop():
+
+        def trace(start: int, stop: int) -> None:
+            nonlocal done
+            # who asked for the picture may not be asked from another thread: Blender's is one
+            ours = threading.get_ident() == caller
+            if ours and should_stop is not None and should_stop():
                 raise Cancelled("rendering was cancelled")
-            pixels = np.arange(start, min(start + settings.chunk, count))
+            pixels = order[start:stop]
             rays = camera_rays(camera, pixels % camera.width, pixels // camera.width)
-            rgba[pixels], depth[pixels] = _trace(scene, rays, settings)
-            if progress is not None:
-                progress(min(1.0, (start + settings.chunk) / count))
+            with torch.inference_mode():
+                rgba[pixels], depth[pixels] = _trace(scene, rays, settings)
+            done += stop - start
+            if ours and progress is not None:
+                progress(min(1.0, done / count))
+
+        run_chunks(trace, count, settings.chunk)
+        if progress is not None:
+            progress(1.0)
     shape = (camera.height, camera.width)
     return Picture(rgba.reshape(*shape, 4), depth.reshape(shape))
 
@@ -197,39 +233,27 @@ def _trace(scene: Scene, rays: RayBatch, settings: RenderSettings) -> tuple[np.n
     colour, depth, left = torch.zeros(count, 4), torch.zeros(count), torch.ones(count)
     ops = kernels.select("cpu")
     jitter = torch.full((count,), 0.5)
-    field, reach = scene.avatar.field, scene.avatar.config.reach
-    around = box(scene.shell), 0.0
-    if not settings.skip:
-        around = scene.mesh.vertices, reach
+    field = scene.avatar.field
+    around = (scene.voxels.box, 0.0) if settings.skip else (scene.mesh.vertices, _reach(scene))
     near, far = ops.marching.bounds(*around, rays.origins, rays.directions)
     first, last = ops.marching.lattice(near, far, jitter, settings.step)
     alive = (last >= first).nonzero()[:, 0]
     while len(alive):
         part = rays.pick(alive)
-        wave = ops.marching.march(
-            scene.mesh,
-            part.origins,
-            part.directions,
-            first[alive],
-            last[alive],
-            jitter[alive],
-            settings.step,
-            wave=settings.wave,
-            clearance=scene.clearance,
-            shell=scene.shell if settings.skip else None,
-            band=reach,
-            leap_limit=0.004 if settings.skip else 0.0,
-        )
-        packed, _ = pack(wave, jitter[alive], settings.step)
+        wave = _wave(scene, part, first[alive], last[alive], left[alive], settings)
+        packed, slots = pack(wave, jitter[alive], settings.step)
         if len(packed):
             samples = samples_of(
                 packed, scene.clearance, 0, scene.condition, part.directions, scene.rotation
             )
             sigma, inputs = field.geometry(samples, scene.worn)
             ray = alive[packed.ray.long()]
-            weights = ops.marching.weigh(sigma, settings.step, ray.int(), left)
+            width = torch.full_like(sigma, settings.step)
+            if isinstance(wave, Picks):
+                width *= wave.steps.view(-1)[slots]
+            weights = ops.marching.weigh(sigma, width, ray.int(), left)
             depth.index_add_(0, ray, weights * packed.t)
-            shown = (weights > settings.negligible * settings.step).nonzero()[:, 0]
+            shown = (weights > settings.negligible * width).nonzero()[:, 0]
             rgb = field.shade(inputs[shown], samples.direction, samples.ray[shown])
             weight = weights[shown, None]
             colour.index_add_(0, ray[shown], torch.cat([weight * rgb, weight], 1))
@@ -245,3 +269,39 @@ def _trace(scene: Scene, rays: RayBatch, settings: RenderSettings) -> tuple[np.n
     rgba = torch.where(seen[:, None], torch.cat([straight, alpha[:, None]], 1), 0.0)
     along = torch.where(seen, depth / safe[:, 0] * rays.cosine, torch.inf)
     return rgba.numpy(), along.numpy()
+
+
+def _reach(scene: Scene) -> float:
+    return scene.avatar.config.reach
+
+
+def _wave(
+    scene: Scene,
+    rays: RayBatch,
+    first: torch.Tensor,
+    last: torch.Tensor,
+    left: torch.Tensor,
+    settings: RenderSettings,
+) -> Picks | Wave:
+    """The next samples of rays [R] that are to look at lattice indices first..last [R]."""
+    ops = kernels.select("cpu")
+    middle = torch.full((len(rays),), 0.5)
+    lattice = rays.origins, rays.directions, first, last, middle
+    space, reach = scene.clearance, _reach(scene)
+    if not settings.skip:
+        options = {"clearance": space, "band": reach, "leap_limit": 0.0}
+        return ops.marching.march(
+            scene.mesh, *lattice, settings.step, wave=settings.wave, **options
+        )
+    return ops.picking.pick(
+        scene.mesh,
+        scene.voxels,
+        scene.guide,
+        *lattice,
+        middle,
+        left,
+        settings.step,
+        clearance=space,
+        band=reach,
+        thrift=Thrift(settings.wave, settings.share, settings.longest, least=settings.least),
+    )

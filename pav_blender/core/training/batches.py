@@ -10,7 +10,7 @@ import torch
 
 from .. import kernels
 from ..config import Config
-from ..deformation import Clearance, Deformer, PosedMesh, box, shell
+from ..deformation import Clearance, Deformer, PosedMesh, Thrift, Voxels, voxels
 from ..deformation.rigid import head_rotation, head_turn
 from ..field.field import Samples, condition
 from ..rendering.rays import Packed, RayBatch, camera_rays, pack
@@ -19,6 +19,7 @@ from .occupancy import Visibility
 
 _UNIFORM = 0.05  # part of the tiles drawn from anywhere in the picture
 _KEPT_POSES = 512
+_THRIFT = Thrift(width=48, share=0.05, longest=3, opaque=8.0)
 
 
 @dataclass(eq=False)
@@ -53,14 +54,14 @@ class _Posed:
     mesh: PosedMesh
     rotation: np.ndarray
     turn: np.ndarray
-    shell: Clearance
+    voxels: Voxels
     version: int
 
 
 class Poses:
-    """Frames' posed meshes, head rotations and shells, the most recently used ones kept.
+    """Frames' posed meshes, head rotations and voxels, the most recently used ones kept.
 
-    Cells are only ever emptied, so that an old shell is still right, merely wide.
+    Cells are only ever emptied, so that old voxels are still right, merely more than needed.
     """
 
     def __init__(self, deformer: Deformer, canonical: np.ndarray, weights: np.ndarray) -> None:
@@ -68,19 +69,19 @@ class Poses:
         self._kept: OrderedDict[str, _Posed] = OrderedDict()
 
     def __call__(self, frame: Frame, space: Clearance, version: int, reach: float) -> _Posed:
-        """The frame posed; its shell is that of `version` of the space, or a later one."""
+        """The frame posed; its voxels are those of `version` of the space, or a later one."""
         known = self._kept.get(frame.name)
         if known is None:
             mesh = self._deformer.pose(frame.vertices)
             meshes = self._canonical, frame.vertices, self._weights
             rotation = head_rotation(*meshes)
             turn = head_turn(*meshes, rotation)
-            known = _Posed(mesh, rotation, turn, shell(mesh, space, reach), version)
+            known = _Posed(mesh, rotation, turn, voxels(mesh, space, reach), version)
             self._kept[frame.name] = known
             if len(self._kept) > _KEPT_POSES:
                 self._kept.popitem(last=False)
         elif known.version != version:
-            known.shell, known.version = shell(known.mesh, space, reach), version
+            known.voxels, known.version = voxels(known.mesh, space, reach), version
         self._kept.move_to_end(frame.name)
         return known
 
@@ -156,21 +157,25 @@ def pick_samples(
         space = visibility.spaces[appearance]
         posed = poses(pixels.frames[index], space, visibility.version, config.reach)
         rays = pixels.rays.origins[a:b], pixels.rays.directions[a:b]
-        near, far = ops.marching.bounds(box(posed.shell), 0.0, *rays)
+        near, far = ops.marching.bounds(posed.voxels.box, 0.0, *rays)
+        first, last = ops.marching.lattice(near, far, jitter[a:b], step)
         picks = ops.picking.pick(
             posed.mesh,
+            posed.voxels,
+            visibility.guide[appearance],
             *rays,
-            *ops.marching.lattice(near, far, jitter[a:b], step),
+            first,
+            last,
             jitter[a:b],
             chance[a:b],
+            torch.ones(b - a),
             step,
             clearance=space,
-            guide=visibility.guide[appearance],
-            shell=posed.shell,
             band=config.reach,
+            thrift=_THRIFT,
         )
         looks += int(picks.looks.sum())
-        ended.append(picks.ended)
+        ended.append(picks.next <= last)
         packed, slots = pack(picks, jitter[a:b], step)
         packed.ray += a
         parts.append(packed)

@@ -1,4 +1,4 @@
-"""The paper's losses (Optimization): colour and depth, each a mean over the rays of a batch."""
+"""The paper's losses (Optimization), colour and depth, and one against fog; means over rays."""
 
 from __future__ import annotations
 
@@ -43,3 +43,23 @@ def losses(
     gap = torch.where(face, (depth * pixels.rays.cosine - pixels.depth).abs(), 0.0).mean()
     total = config.colour_weight * mse + config.depth_weight * gap
     return Loss(total, float(mse.detach()), float(gap.detach()))
+
+
+def distortion(
+    weights: torch.Tensor, t: torch.Tensor, ray: torch.Tensor, rays: int
+) -> torch.Tensor:
+    """How far apart along a ray its weights lie, metres: the mean over rays of the sum over pairs
+    of w_i w_j |t_i - t_j| (Mip-NeRF 360, Eq. 15, without the term within a sample).
+
+    weights, t, ray [N], sorted by ray and along it. Fog spreads a ray's weight: without fog fewer
+    samples show the same.
+    """
+    index = ray.long()
+    counts = torch.bincount(index, minlength=rays)
+    place = torch.arange(len(index), device=ray.device)
+    place = place - (torch.cumsum(counts, 0) - counts)[index]
+    shape = (rays, int(counts.max()) if len(index) else 0)
+    w = weights.new_zeros(shape).index_put((index, place), weights)
+    at = t.new_zeros(shape).index_put((index, place), t)
+    before, moment = torch.cumsum(w, 1) - w, torch.cumsum(w * at, 1) - w * at
+    return 2 * (w * (at * before - moment)).sum() / max(rays, 1)

@@ -14,9 +14,10 @@ from scipy import ndimage
 from .. import kernels
 from ..deformation import Clearance, Deformer
 from ..field.avatar import Avatar
+from ..kernels.reference.picking import LEAST
 from ..rendering.render import clearance_of
 
-_MUCH = 0.8  # part of the space that is left when shells are worth making anew
+_MUCH = 0.5  # part of the space that is left when voxels are worth finding anew
 _SEEN = 0.1  # transmittance from which a look at a cell counts
 _LOOKS = 8.0  # looks after which a cell is judged
 _BLOCK_LOOKS = 16.0  # the same for eight cells together
@@ -59,13 +60,22 @@ class Visibility:
         self.version = 0
         self._marked = 1.0
         self._refresh()
+        self._forget_emptied()
 
     def _refresh(self) -> None:
         filled = float(self.occupied.mean())
-        if filled < _MUCH * self._marked:
-            self._marked = filled
-            self.version += 1
+        if self.spaces and filled >= _MUCH * self._marked:
+            # distances that were measured before the last cells were emptied are still safe
+            for space, cells in zip(self.spaces, self.occupied, strict=True):
+                space.grid.clamp_(min=torch.from_numpy(~cells).to(torch.uint8))
+            return
+        self._marked = filled
+        self.version += 1
         self.spaces = [clearance_of(cells, *self._box) for cells in self.occupied]
+
+    def _forget_emptied(self) -> None:
+        """No ray may end in a voxel that is beside an occupied cell for what was there once."""
+        self.guide[torch.from_numpy(~self.occupied)] = LEAST
 
     def state(self) -> dict[str, torch.Tensor]:
         """What an interrupted training must keep."""
@@ -128,4 +138,5 @@ class Visibility:
         self.weight[judged] = 0
         self.looks[judged] = 0
         self._refresh()
+        self._forget_emptied()
         return float(self.occupied.mean())

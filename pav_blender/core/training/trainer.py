@@ -15,14 +15,14 @@ from ..deformation import Deformer
 from ..field.avatar import Avatar
 from .batches import Poses, draw_pixels, pick_samples
 from .frames import Frame, halved
-from .losses import Loss, losses
+from .losses import Loss, distortion, losses
 from .occupancy import Visibility
 
 _FIRST_STEP = 8.0  # the first samples are this many times as far apart as the last
-_LOOKS_A_RAY = 24  # the step is as fine as this many looks a ray allow
+_LOOKS_A_RAY = 40  # the step is as fine as this many looks a ray allow
 _SAMPLES = 1 << 14  # samples a batch, by the number of its rays
 _CARVED = 0.5  # part of the schedule in which space is emptied often
-_PRUNE_EVERY = 40  # iterations, while there is much to empty
+_PRUNE_EVERY = 50  # iterations, while there is much to empty
 _PRUNE_LATER = 200
 _WARM_UP = 20
 # parts of the schedule until which pictures are a half and a quarter as large: there are more
@@ -102,7 +102,8 @@ class Trainer:
         counted = ~picked.ended | (opacity.detach() > 1 - _ENDED)
         loss = losses(config, pixels, background, colour, opacity, depth, counted)
         if torch.isfinite(loss.total):
-            loss.total.backward()
+            spread = distortion(weights, picked.t, picked.samples.ray, count)
+            (loss.total + config.distortion_weight * spread).backward()
             self._adam(picked.samples.canonical, encoded)
             self.visibility.watch(picked.cells, sigma.detach(), weights.detach(), picked.width)
         status.iteration += 1

@@ -91,7 +91,7 @@ def _cell(size, corner, scale, x, y, z):
 
 
 @njit(**INLINE)
-def _clear_cells(grid, size, corner, scale, x, y, z):
+def clear_cells(grid, size, corner, scale, x, y, z):
     """Cells to the nearest occupied one from canonical (x, y, z): 0 inside an occupied cell."""
     fx, fy, fz = (x - corner[0]) * scale, (y - corner[1]) * scale, (z - corner[2]) * scale
     outside = max(max(-fx, -fy, -fz), max(fx, fy, fz) - np.float32(size))
@@ -104,40 +104,40 @@ def _clear_cells(grid, size, corner, scale, x, y, z):
 
 
 @njit(**INLINE)
-def _next_filled(shell, size, corner, scale, rays, i, k, last, step):
-    """The first lattice index from k on at which lane i's ray may be near anything."""
-    jitter = rays[6 * LANES + i]
-    while k <= last:
-        t = (np.float32(k) + jitter) * step
-        leave = np.float32(np.inf)
-        inside = True
-        clear = 0
-        at = 0
-        for axis in range(3):
-            d = rays[(axis + 3) * LANES + i]
-            f = (rays[axis * LANES + i] + t * d - corner[axis]) * scale
-            if not (f >= 0 and f < size):
-                inside = False
-            else:
-                at = at * size + int(f)
-        if not inside:  # rays are followed within the shell's box: this is rounding
-            return k
-        clear = int(shell[at])
-        if clear == 0:
-            return k
-        for axis in range(3):
-            d = rays[(axis + 3) * LANES + i] * scale
-            if d == 0:
-                continue
-            f = (rays[axis * LANES + i] - corner[axis]) * scale + t * d
-            wall = np.float32(int(f) + clear if d > 0 else int(f) + 1 - clear)
-            leave = min(leave, (wall - f) / d)
-        k += max(np.int32(min(leave / step, np.float32(last - k))), np.int32(0)) + np.int32(1)
-    return k
+def locate(arrays, triangle_maps, vertex_maps, vertices, corners, px, py, pz, going, band,
+           stack, scratch, feet, triangle, barycentric, canonical, distances):  # fmt: skip
+    """Where the points of a packet lie: triangle [16], barycentric and canonical [3 * 16],
+    distances [16]; feet [3 * 16], the nearest points found before, bound the search and are set to
+    those found now. Canonical places count where `going` and within the band."""
+    gx, gy, gz = px - load(feet, 0), py - load(feet, LANES), pz - load(feet, 2 * LANES)
+    # The last nearest point is a bound; rounding must leave it above the answer.
+    best = fma(gx, gx, fma(gy, gy, fma(gz, gz, splat(1e-12)))) * splat(1.00001)
+    best = select(going, best, splat(-1.0))
+    boxes, starts, records = arrays[0], arrays[1], arrays[2]
+    best, found = search(boxes, starts, records, px, py, pz, best, splat_int(-1), stack, scratch)
+    slots = select(found < splat_int(0), splat_int(0), found)
+    wa, wb, wc, qx, qy, qz = foot(records, slots, px, py, pz)
+    store(feet, 0, qx)
+    store(feet, LANES, qy)
+    store(feet, 2 * LANES, qz)
+    distance = square_root(select(going, best, splat(0.0)))
+    store(distances, 0, distance)
+    settle(arrays, found, wa, wb, wc, triangle, barycentric)
+    if bits(going & (distance <= splat(band))) == 0:
+        return
+    index = load(triangle, 0)
+    index = select(index < splat_int(0), splat_int(0), index)
+    wa, wb, wc = load(barycentric, 0), load(barycentric, LANES), load(barycentric, 2 * LANES)
+    x, y, z = _canonical(
+        triangle_maps, vertex_maps, vertices, corners, index, wa, wb, wc, px, py, pz
+    )
+    store(canonical, 0, x)
+    store(canonical, LANES, y)
+    store(canonical, 2 * LANES, z)
 
 
 @njit(**OPTIONS)
-def march_rays(
+def _march(
     start,
     stop,
     arrays,
@@ -155,16 +155,9 @@ def march_rays(
     size,
     corner,
     scale,
-    shell,
-    shell_size,
-    shell_corner,
-    shell_scale,
     band,
     leap_limit,
-    guide,
-    opaque,
     wave,
-    out_density,
     out_count,
     out_next,
     out_k,
@@ -173,12 +166,7 @@ def march_rays(
     out_canonical,
     out_distance,
 ):
-    """Samples of rays start to stop into the slots of a wave; `march` says which.
-
-    With a guide [G^3], densities (1/m) of the cells, a ray ends where it has passed `opaque`
-    optical depths of it.
-    """
-    boxes, starts, records = arrays[0], arrays[1], arrays[2]
+    """Samples of rays start to stop into the slots of a wave; `march` says which."""
     stack = np.empty(STACK, np.int32)
     scratch = np.empty(LANES, np.float32)
     rays = np.empty(7 * LANES, np.float32)  # origin, direction, jitter
@@ -189,8 +177,6 @@ def march_rays(
     triangle = np.empty(LANES, np.int32)
     ks = np.empty(LANES, np.int32)
     active = np.empty(LANES, np.int32)
-    passed = np.zeros(LANES, np.float32)
-    guided = len(guide) > 0
     steps = splat(step)
     cell = np.float32(1.0) / scale
     for base in range(start, stop, LANES):
@@ -203,26 +189,12 @@ def march_rays(
                 feet[axis * LANES + i] = np.inf
             rays[6 * LANES + i] = jitter[ray]
             ks[i] = first[ray]
-            passed[i] = 0
             active[i] = 1 if base + i < stop and first[ray] <= last[ray] else 0
             alive += active[i]
             if base + i < stop:
                 out_count[ray] = 0
                 out_next[ray] = max(first[ray], last[ray] + 1)
         while alive > 0:
-            if shell_size > 0:
-                for i in range(LANES):
-                    if active[i] == 0:
-                        continue
-                    end = last[base + i]
-                    ks[i] = _next_filled(
-                        shell, shell_size, shell_corner, shell_scale, rays, i, ks[i], end, step
-                    )
-                    if ks[i] > end:
-                        active[i] = 0
-                        alive -= 1
-                if alive == 0:
-                    break
             going = splat_int(0) < load(active, 0)
             t = (to_float(load(ks, 0)) + load(rays, 6 * LANES)) * steps
             px = fma(t, load(rays, 3 * LANES), load(rays, 0))
@@ -232,39 +204,9 @@ def march_rays(
             px = select(going, px, splat(lane(px, some)))
             py = select(going, py, splat(lane(py, some)))
             pz = select(going, pz, splat(lane(pz, some)))
-            # The last nearest point is a bound; rounding must leave it above the answer.
-            gx, gy, gz = px - load(feet, 0), py - load(feet, LANES), pz - load(feet, 2 * LANES)
-            best = fma(gx, gx, fma(gy, gy, fma(gz, gz, splat(1e-12)))) * splat(1.00001)
-            best = select(going, best, splat(-1.0))
-            best, found = search(
-                boxes, starts, records, px, py, pz, best, splat_int(-1), stack, scratch
-            )
-            slots = select(found < splat_int(0), splat_int(0), found)
-            wa, wb, wc, qx, qy, qz = foot(records, slots, px, py, pz)
-            store(feet, 0, qx)
-            store(feet, LANES, qy)
-            store(feet, 2 * LANES, qz)
-            distance_here = square_root(select(going, best, splat(0.0)))
-            store(distances, 0, distance_here)
-            settle(arrays, found, wa, wb, wc, triangle, barycentric)
-            if bits(going & (distance_here <= splat(band))) != 0:
-                index = load(triangle, 0)
-                x, y, z = _canonical(
-                    triangle_maps,
-                    vertex_maps,
-                    vertices,
-                    flat_corners,
-                    select(index < splat_int(0), splat_int(0), index),
-                    load(barycentric, 0),
-                    load(barycentric, LANES),
-                    load(barycentric, 2 * LANES),
-                    px,
-                    py,
-                    pz,
-                )
-                store(canonical, 0, x)
-                store(canonical, LANES, y)
-                store(canonical, 2 * LANES, z)
+            locate(arrays, triangle_maps, vertex_maps, vertices, flat_corners, px, py, pz, going,
+                   band, stack, scratch, feet, triangle, barycentric, canonical,
+                   distances)  # fmt: skip
             for i in range(LANES):
                 if active[i] == 0:
                     continue
@@ -280,7 +222,7 @@ def march_rays(
                     cells = 0
                     u, v, w = canonical[i], canonical[LANES + i], canonical[2 * LANES + i]
                     if size > 0:
-                        cells = _clear_cells(grid, size, corner, scale, u, v, w)
+                        cells = clear_cells(grid, size, corner, scale, u, v, w)
                     if cells == 0:
                         slot = out_count[ray]
                         out_k[ray, slot] = k
@@ -290,11 +232,7 @@ def march_rays(
                             out_barycentric[ray, slot, axis] = barycentric[axis * LANES + i]
                             out_canonical[ray, slot, axis] = canonical[axis * LANES + i]
                         out_count[ray] = slot + 1
-                        if guided:
-                            at = _cell(size, corner, scale, u, v, w)
-                            out_density[ray, slot] = guide[at]
-                            passed[i] += guide[at] * step
-                        if slot + 1 == wave or passed[i] > opaque:
+                        if slot + 1 == wave:
                             out_next[ray] = k + 1
                             active[i] = 0
                             alive -= 1
@@ -306,8 +244,6 @@ def march_rays(
                 if k + leap > last[ray]:
                     active[i] = 0
                     alive -= 1
-    if guided:  # whoever picks from the slots goes by their count
-        return
     for ray in range(start, stop):
         for slot in range(out_count[ray], wave):
             out_k[ray, slot] = -1
@@ -319,7 +255,6 @@ def march_rays(
 
 
 _NOTHING = np.empty(0, np.float32)
-_NO_ROWS = np.empty((0, 0), np.float32)
 
 
 def flat(values: torch.Tensor | None) -> np.ndarray:
@@ -350,11 +285,9 @@ def walk(
     jitter: torch.Tensor,
     step: float,
     clearance: Clearance | None,
-    shell: Clearance | None,
     band: float,
-    leap_limit: float,
 ) -> tuple[Any, ...]:
-    """What `march_rays` is told of where to go, arguments as `march`."""
+    """What compiled functions are told of a mesh, rays and the clearance; as `march`."""
     return (
         mesh.search.arrays,
         flat(mesh.triangle_maps),
@@ -368,9 +301,7 @@ def walk(
         rows_of(jitter, np.float32),
         np.float32(step),
         *grid_of(clearance),
-        *grid_of(shell),
         np.float32(band),
-        np.float32(leap_limit),
     )
 
 
@@ -385,7 +316,6 @@ def march(
     *,
     wave: int,
     clearance: Clearance | None = None,
-    shell: Clearance | None = None,
     band: float = np.inf,
     leap_limit: float = 0.004,
 ) -> Wave:
@@ -395,7 +325,6 @@ def march(
     its canonical cell is occupied. Outside the band a ray leaps by what certainly stays outside; in
     empty cells by 0.7 of the clear distance, at most `leap_limit` metres, which can pass over an
     occupied cell only where the map to canonical space stretches more or jumps (between lips).
-    With a `shell` (`deformation.shell`) a ray leaps over the posed space that it says is clear.
     """
     count = len(origins)
     result = Wave(
@@ -408,16 +337,12 @@ def march(
         torch.empty((count, wave)),
     )
     run_chunks(
-        march_rays,
+        _march,
         count,
         _CHUNK,
-        *walk(
-            mesh, origins, directions, first, last, jitter, step, clearance, shell, band, leap_limit
-        ),
-        _NOTHING,
-        np.float32(np.inf),
+        *walk(mesh, origins, directions, first, last, jitter, step, clearance, band),
+        np.float32(leap_limit),
         wave,
-        _NO_ROWS,
         *(values.numpy() for values in result),
     )
     return result

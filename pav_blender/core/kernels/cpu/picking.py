@@ -1,4 +1,8 @@
-"""The samples that training takes, for the CPU; see `reference/picking.py`."""
+"""Few samples along a ray, for the CPU; see `reference/picking.py`.
+
+First every ray by itself runs over the voxels, then sixteen neighbouring rays at a time look for
+the nearest triangles of what they chose.
+"""
 
 from __future__ import annotations
 
@@ -6,120 +10,252 @@ import numpy as np
 import torch
 from numba import njit
 
-from ..reference.picking import FALL, LEAST, LONGEST, LOOKS, OPAQUE, RISE, SHARE, WIDTH
-from ..structures import Clearance, Picks, PosedMesh
-from .marching import flat, march_rays, rows_of, walk
-from .search import OPTIONS
+from ..reference.picking import BRICK, FALL, GOLDEN, LEAST, RISE
+from ..structures import Clearance, Picks, PosedMesh, Thrift, Voxels
+from .lanes import LANES, bits, lane, load, lowest_bit, select, splat, splat_int
+from .marching import clear_cells, flat, grid_of, locate, rows_of, walk
+from .search import INLINE, OPTIONS, STACK
 from .threads import run_chunks
 
-_CHUNK = 128  # rays a thread takes at a time
-_OPAQUE, _SHARE = np.float32(OPAQUE), np.float32(SHARE)
-_GOLDEN = np.float32(0.6180339887)
+_CHUNK = 128  # rays a thread takes at a time: a multiple of LANES
+_GOLDEN = np.float32(GOLDEN)
 
 
 def pick(
     mesh: PosedMesh,
+    voxels: Voxels,
+    guide: torch.Tensor,
     origins: torch.Tensor,
     directions: torch.Tensor,
     first: torch.Tensor,
     last: torch.Tensor,
     jitter: torch.Tensor,
-    random: torch.Tensor,
+    chance: torch.Tensor,
+    left: torch.Tensor,
     step: float,
     *,
     clearance: Clearance,
-    guide: torch.Tensor,
-    shell: Clearance | None = None,
-    band: float = np.inf,
-    leap_limit: float = 0.004,
+    band: float,
+    thrift: Thrift,
 ) -> Picks:
-    """As the reference; up to the rounding of the march."""
-    count = len(origins)
+    """As the reference; up to the rounding of the places."""
+    count, width = len(origins), thrift.width
+    whole = torch.int32
     result = Picks(
-        torch.zeros(count, dtype=torch.int32),
-        torch.zeros(count, dtype=torch.int32),
-        torch.zeros(count, dtype=torch.bool),
-        torch.empty((count, WIDTH), dtype=torch.int32),
-        torch.empty((count, WIDTH), dtype=torch.int32),
-        torch.empty((count, WIDTH), dtype=torch.int32),
-        torch.empty((count, WIDTH, 3)),
-        torch.empty((count, WIDTH, 3)),
-        torch.empty((count, WIDTH)),
+        torch.zeros(count, dtype=whole),
+        torch.zeros(count, dtype=whole),
+        torch.zeros(count, dtype=whole),
+        torch.zeros((count, width), dtype=whole),
+        torch.zeros((count, width), dtype=whole),
+        torch.zeros((count, width), dtype=whole),
+        torch.zeros((count, width, 3)),
+        torch.zeros((count, width, 3)),
+        torch.zeros((count, width)),
     )
     run_chunks(
         _pick,
         count,
         _CHUNK,
-        *walk(
-            mesh, origins, directions, first, last, jitter, step, clearance, shell, band, leap_limit
-        ),
-        rows_of(random, np.float32),
+        *walk(mesh, origins, directions, first, last, jitter, step, clearance, band),
+        rows_of(voxels.bricks.view(-1), np.int32),
+        len(voxels.bricks),
+        rows_of(voxels.cells.view(-1), np.int32),
+        flat(voxels.box_min),
+        np.float32(voxels.scale),
         flat(guide),
+        rows_of(chance, np.float32),
+        rows_of(left, np.float32),
+        np.float32(thrift.share),
+        thrift.longest,
+        np.float32(thrift.opaque),
+        np.float32(thrift.least),
         *(values.numpy() for values in result),
     )
     return result
 
 
+@njit(**INLINE)
+def _choose(ray, first, last, origins, directions, jitter, step, bricks, brick_count, cells, corner,
+            scale, guide, chance, left, share, longest, opaque, least, width, k_out,
+            steps_out):  # fmt: skip
+    """The places of one ray that are samples: how many, how many looks, where to go on."""
+    ox = (origins[ray, 0] - corner[0]) * scale
+    oy = (origins[ray, 1] - corner[1]) * scale
+    oz = (origins[ray, 2] - corner[2]) * scale
+    dx, dy, dz = directions[ray, 0] * scale, directions[ray, 1] * scale, directions[ray, 2] * scale
+    end = np.float32(brick_count)
+    count, looks, length, begin = 0, 0, 0, 0
+    added, passed = np.float32(0.0), np.float32(0.0)
+    k = first
+    while k <= last:
+        t = (np.float32(k) + jitter) * step
+        x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
+        k += 1
+        if not (min(x, y, z) >= 0 and max(x, y, z) < end):
+            continue
+        u, v, w = int(x), int(y), int(z)
+        row = bricks[(u * brick_count + v) * brick_count + w]
+        if row < 0:
+            # up to where the ray leaves the bricks that are clear as well
+            leave = min(_until(x, dx, u, -row), _until(y, dy, v, -row), _until(z, dz, w, -row))
+            k += max(np.int64(min(leave / step, np.float32(last - k))), 0)
+            continue
+        u = int((x - np.float32(u)) * BRICK)
+        v = int((y - np.float32(v)) * BRICK)
+        w = int((z - np.float32(w)) * BRICK)
+        cell = cells[((row * BRICK + u) * BRICK + v) * BRICK + w]
+        if cell < 0:
+            continue
+        density = guide[cell]
+        if not density >= least:
+            continue
+        optical = density * step
+        more = left * (np.float32(1.0) - np.exp(-optical))
+        if length > 0 and length < longest and begin + length == k - 1 and added + more <= share:
+            length += 1
+            added += more
+        else:
+            if length > 0:
+                count, chance = _close(k_out, steps_out, count, begin, length, chance)
+                length = 0
+            if count == width:
+                return count, looks, k - 1
+            begin, length, added = k - 1, 1, more
+        looks += 1
+        if opaque < np.inf:
+            left -= more
+            passed += optical
+            if passed > opaque:
+                break
+    if length > 0:
+        count, chance = _close(k_out, steps_out, count, begin, length, chance)
+    return count, looks, k
+
+
+@njit(**INLINE)
+def _until(x, d, cell, clear):
+    """How far along the ray x leaves the cells that are nearer than `clear` to this one."""
+    if d > 0:
+        return (np.float32(cell + clear) - x) / d
+    if d < 0:
+        return (np.float32(cell + 1 - clear) - x) / d
+    return np.float32(np.inf)
+
+
+@njit(**INLINE)
+def _close(k_out, steps_out, count, begin, length, chance):
+    """One of the places taken together becomes a sample."""
+    k_out[count] = begin + min(int(chance * np.float32(length)), length - 1)
+    steps_out[count] = length
+    chance += _GOLDEN
+    if chance >= 1:
+        chance -= np.float32(1.0)
+    return count + 1, chance
+
+
 @njit(**OPTIONS)
 def _pick(start, stop, arrays, triangle_maps, vertex_maps, vertices, corners,
-          origins, directions, first, last, jitter, step,
-          grid, size, corner, scale, shell, shell_size, shell_corner, shell_scale,
-          band, leap_limit, random, guide, out_count, out_looks, out_ended, out_k, out_steps,
+          origins, directions, first, last, jitter, step, grid, size, corner, scale, band,
+          bricks, brick_count, cells, brick_corner, brick_scale, guide, chance, left,
+          share, longest, opaque, least, out_count, out_looks, out_next, out_k, out_steps,
           out_triangle, out_barycentric, out_canonical, out_distance):  # fmt: skip
-    rays = stop - start
-    density = np.empty((rays, LOOKS), np.float32)
-    looks = np.zeros(rays, np.int32)
-    following = np.zeros(rays, np.int32)
-    k = np.empty((rays, LOOKS), np.int32)
-    triangle = np.empty((rays, LOOKS), np.int32)
-    barycentric = np.empty((rays, LOOKS, 3), np.float32)
-    canonical = np.empty((rays, LOOKS, 3), np.float32)
-    distance = np.empty((rays, LOOKS), np.float32)
-    march_rays(0, rays, arrays, triangle_maps, vertex_maps, vertices, corners,
-               origins[start:stop], directions[start:stop], first[start:stop], last[start:stop],
-               jitter[start:stop], step, grid, size, corner, scale,
-               shell, shell_size, shell_corner, shell_scale, band, leap_limit, guide, _OPAQUE,
-               LOOKS, density, looks, following, k, triangle, barycentric, canonical,
-               distance)  # fmt: skip
-    for i in range(rays):
-        ray = start + i
-        out_looks[ray] = looks[i]
-        slot, place = 0, 0
-        left = np.float32(1.0)
-        chance = random[ray]
-        while place < looks[i] and slot < WIDTH:
-            length, added = _together(place, looks[i], k[i], density[i], left, step)
-            left -= added
-            chosen = place + min(int(chance * length), length - 1)
-            chance += _GOLDEN
-            chance -= np.float32(1.0) if chance >= 1 else np.float32(0.0)
-            out_k[ray, slot] = k[i, chosen]
-            out_steps[ray, slot] = length
-            out_triangle[ray, slot] = triangle[i, chosen]
-            out_distance[ray, slot] = distance[i, chosen]
+    width = out_k.shape[1]
+    for ray in range(start, stop):
+        count, looks, following = _choose(
+            ray, first[ray], last[ray], origins, directions, jitter[ray], step, bricks,
+            brick_count, cells, brick_corner, brick_scale, guide, chance[ray], left[ray], share,
+            longest, opaque, least, width, out_k[ray], out_steps[ray])  # fmt: skip
+        out_count[ray] = count
+        out_looks[ray] = looks
+        out_next[ray] = following
+        if following > last[ray]:
+            out_next[ray] = max(first[ray], last[ray] + 1)
+    stack = np.empty(STACK, np.int32)
+    scratch = np.empty(LANES, np.float32)
+    points = np.empty(3 * LANES, np.float32)
+    feet = np.empty(3 * LANES, np.float32)
+    canonical = np.empty(3 * LANES, np.float32)
+    distances = np.empty(LANES, np.float32)
+    barycentric = np.empty(3 * LANES, np.float32)
+    triangle = np.empty(LANES, np.int32)
+    active = np.zeros(LANES, np.int32)
+    kept = np.zeros(LANES, np.int32)
+    for base in range(start, stop, LANES):
+        rays = min(LANES, stop - base)
+        most = 0
+        for i in range(LANES):
+            kept[i] = 0
             for axis in range(3):
-                out_barycentric[ray, slot, axis] = barycentric[i, chosen, axis]
-                out_canonical[ray, slot, axis] = canonical[i, chosen, axis]
-            slot += 1
-            place += length
-        out_count[ray] = slot
-        out_ended[ray] = following[i] <= last[ray] or place < looks[i]
+                feet[axis * LANES + i] = np.inf
+            if i < rays:
+                most = max(most, out_count[base + i])
+        for slot in range(most):
+            for i in range(LANES):
+                active[i] = 1 if i < rays and slot < out_count[base + i] else 0
+                if active[i] == 0:
+                    continue
+                t = (np.float32(out_k[base + i, slot]) + jitter[base + i]) * step
+                for axis in range(3):
+                    along = t * directions[base + i, axis]
+                    points[axis * LANES + i] = origins[base + i, axis] + along
+            going = splat_int(0) < load(active, 0)
+            px, py, pz = load(points, 0), load(points, LANES), load(points, 2 * LANES)
+            some = lowest_bit(bits(going))
+            px = select(going, px, splat(lane(px, some)))
+            py = select(going, py, splat(lane(py, some)))
+            pz = select(going, pz, splat(lane(pz, some)))
+            locate(arrays, triangle_maps, vertex_maps, vertices, corners, px, py, pz, going, band,
+                   stack, scratch, feet, triangle, barycentric, canonical,
+                   distances)  # fmt: skip
+            for i in range(LANES):
+                if active[i] == 0 or triangle[i] < 0 or not distances[i] <= band:
+                    continue
+                u, v, w = canonical[i], canonical[LANES + i], canonical[2 * LANES + i]
+                if clear_cells(grid, size, corner, scale, u, v, w) > 0:
+                    continue
+                ray, to = base + i, kept[i]
+                out_k[ray, to] = out_k[ray, slot]
+                out_steps[ray, to] = out_steps[ray, slot]
+                out_triangle[ray, to] = triangle[i]
+                out_distance[ray, to] = distances[i]
+                for axis in range(3):
+                    out_barycentric[ray, to, axis] = barycentric[axis * LANES + i]
+                    out_canonical[ray, to, axis] = canonical[axis * LANES + i]
+                kept[i] = to + 1
+        for i in range(rays):
+            out_count[base + i] = kept[i]
+
+
+def brick_cells(
+    canonical: torch.Tensor, maps: torch.Tensor, space: Clearance, voxel: float
+) -> torch.Tensor:
+    """As the reference, up to the rounding of the places."""
+    cells = torch.empty((len(canonical), BRICK**3), dtype=torch.int32)
+    middles, linear = rows_of(canonical, np.float32), rows_of(maps, np.float32)
+    grid = grid_of(space)
+    run_chunks(
+        _brick_cells, len(cells), 512, middles, linear, *grid, np.float32(voxel), cells.numpy()
+    )
+    return cells
 
 
 @njit(**OPTIONS)
-def _together(place, looks, k, density, left, step):
-    """How many places from `place` on go together, and what they add to the pixel."""
-    added = left * (np.float32(1.0) - np.exp(-density[place] * step))
-    length = 1
-    while length < LONGEST and place + length < looks:
-        if k[place + length] != k[place] + length:
-            break  # a gap
-        more = (left - added) * (np.float32(1.0) - np.exp(-density[place + length] * step))
-        if added + more > _SHARE:
-            break
-        added += more
-        length += 1
-    return length, added
+def _brick_cells(start, stop, canonical, maps, grid, size, corner, scale, voxel, out):
+    for brick in range(start, stop):
+        for i in range(BRICK**3):
+            x = np.float32(i // BRICK**2) + np.float32(0.5 - BRICK / 2)
+            y = np.float32(i // BRICK % BRICK) + np.float32(0.5 - BRICK / 2)
+            z = np.float32(i % BRICK) + np.float32(0.5 - BRICK / 2)
+            flat, far = 0, 0
+            for axis in range(3):
+                row = maps[brick, axis]
+                moved = voxel * (row[0] * x + row[1] * y + row[2] * z)
+                place = (canonical[brick, axis] + moved - corner[axis]) * scale
+                cell = int(np.floor(min(max(place, np.float32(-3.0)), np.float32(size + 3))))
+                inside = min(max(cell, 0), size - 1)
+                far = max(far, abs(cell - inside))
+                flat = flat * size + inside
+            out[brick, i] = flat if max(far, int(grid[flat])) <= 1 else -1
 
 
 def follow(guide: torch.Tensor, cells: torch.Tensor, density: torch.Tensor) -> None:

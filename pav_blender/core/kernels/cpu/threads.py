@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import os
+import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -18,6 +19,7 @@ import torch
 
 _pool: ThreadPoolExecutor | None = None
 _pool_size = 0
+_here = threading.local()
 
 
 def threads() -> int:
@@ -68,12 +70,13 @@ def run_chunks(fn: Callable[..., Any], n: int, chunk: int, *args: Any) -> None:
 
     Pieces go to whichever thread is free, the caller's included, so uneven work balances itself;
     which thread runs which piece is not fixed, so pieces must not depend on one another. The first
-    exception is raised here after the others have stopped. Calls may nest.
+    exception is raised here after the others have stopped. A call from within a piece runs in that
+    piece's thread alone: the others have pieces of their own.
     """
     if chunk < 1:
         raise ValueError(f"chunk must be at least 1, not {chunk}")
     pieces = -(-n // chunk)
-    workers = min(threads(), pieces)
+    workers = 1 if getattr(_here, "busy", False) else min(threads(), pieces)
     if workers <= 1:
         for start in range(0, n, chunk):
             fn(start, min(start + chunk, n), *args)
@@ -81,17 +84,20 @@ def run_chunks(fn: Callable[..., Any], n: int, chunk: int, *args: Any) -> None:
     counter = itertools.count()
 
     def work() -> None:
-        for piece in counter:
-            if piece >= pieces:
-                return
-            start = piece * chunk
-            try:
+        _here.busy = True
+        try:
+            for piece in counter:
+                if piece >= pieces:
+                    return
+                start = piece * chunk
                 fn(start, min(start + chunk, n), *args)
-            except BaseException:
-                for _ in range(pieces):  # nothing is left for the others
-                    if next(counter) >= pieces:
-                        break
-                raise
+        except BaseException:
+            for _ in range(pieces):  # nothing is left for the others
+                if next(counter) >= pieces:
+                    break
+            raise
+        finally:
+            _here.busy = False
 
     helpers = [_executor(workers - 1).submit(work) for _ in range(workers - 1)]
     try:

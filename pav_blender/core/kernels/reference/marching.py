@@ -81,17 +81,15 @@ def march(
     *,
     wave: int,
     clearance: Clearance | None = None,
-    shell: Clearance | None = None,
     band: float = torch.inf,
     leap_limit: float = 0.004,
 ) -> Wave:
     """Up to `wave` samples a ray among lattice indices first..last [R] int32, in order.
 
     A sample counts when it is within `band` metres of the posed mesh and, with a clearance, when
-    its canonical cell is occupied. `shell` and `leap_limit` are for the compiled kernel: here
-    nothing is leapt.
+    its canonical cell is occupied. `leap_limit` is for the compiled kernel: here nothing is leapt.
     """
-    del leap_limit, shell
+    del leap_limit
     rays, device = len(origins), origins.device
     counts = (last - first + 1).clamp(min=0).long()
     ray = torch.repeat_interleave(torch.arange(rays, device=device), counts)

@@ -1,9 +1,9 @@
-"""The samples that training takes: few along a ray, and each where it teaches something.
+"""Few samples along a ray, and each where it tells something; no network runs to find them.
 
-A guide, the density that the field had of late in every canonical cell, tells what each place
-along a ray would add to its pixel. Places that follow one another are taken together until they
-add enough, and one of them, drawn at random, stands for all: thin fog is stepped through
-coarsely, a surface finely, and no network runs to find that out.
+A guide, the density of every canonical cell as it was of late, tells what each place along a ray
+would add to its pixel, and `Voxels` which cell a place is in. Places that follow one another are
+taken together until they add enough, and one of them stands for all: thin fog is stepped through
+coarsely, a surface finely. Only samples search for their nearest triangle.
 """
 
 from __future__ import annotations
@@ -12,92 +12,178 @@ import math
 
 import torch
 
-from ..structures import Clearance, Picks, PosedMesh
-from .marching import march
+from ..structures import Clearance, Picks, PosedMesh, Thrift, Voxels
+from .marching import canonicalise, occupied
+from .nearest import nearest
 
-LOOKS = 96  # places that are looked at on a ray, at most
-WIDTH = 48  # samples a ray, at most
-SHARE = 0.05  # of a pixel that places taken together may add
-LONGEST = 3  # places taken together, at most
-OPAQUE = 8.0  # optical depth at which a ray ends
+BRICK = 4  # voxels a side
 LEAST = 1e-4  # density (1/m) that the guide calls empty
 RISE, FALL = 0.15, 0.5  # parts of the way that one sample moves the guide
-_GOLDEN = 0.6180339887
+GOLDEN = 0.6180339887
 
 
 def pick(
     mesh: PosedMesh,
+    voxels: Voxels,
+    guide: torch.Tensor,
     origins: torch.Tensor,
     directions: torch.Tensor,
     first: torch.Tensor,
     last: torch.Tensor,
     jitter: torch.Tensor,
-    random: torch.Tensor,
+    chance: torch.Tensor,
+    left: torch.Tensor,
     step: float,
     *,
     clearance: Clearance,
-    guide: torch.Tensor,
-    shell: Clearance | None = None,
-    band: float = math.inf,
-    leap_limit: float = 0.004,
+    band: float,
+    thrift: Thrift,
 ) -> Picks:
-    """Samples among the places that `march` finds, by the guide [G, G, G] float32 (1/m).
+    """Samples among lattice indices first..last [R] int32 that lie in voxels with a cell.
 
-    random [R] in [0, 1) decides which place of those taken together is the sample. Together the
-    samples stand for every place up to where the guide is opaque.
+    guide [G, G, G] float32 (1/m); chance [R] in [0, 1) decides which place of those taken together
+    is the sample; left [R] is the transmittance that rays start with. Samples whose canonical point
+    is in no occupied cell, or farther than `band` metres from the mesh, are dropped.
     """
-    wave = march(
-        mesh, origins, directions, first, last, jitter, step,
-        wave=LOOKS, clearance=clearance, shell=shell, band=band, leap_limit=leap_limit,
-    )  # fmt: skip
-    size = clearance.grid.shape[0]
-    cell = torch.floor((wave.canonical - clearance.box_min) * (clearance.box_scale * size))
-    x, y, z = cell.long().clamp(0, size - 1).unbind(-1)
-    optical = guide.to(wave.canonical)[x, y, z] * step
-    rays = len(origins)
-    slots = torch.zeros((rays, WIDTH), dtype=torch.int64)
-    steps = torch.zeros((rays, WIDTH), dtype=torch.int32)
-    count, looks = (torch.zeros(rays, dtype=torch.int32) for _ in range(2))
-    ended = torch.zeros(rays, dtype=torch.bool)
-    for ray in range(rays):
-        k = wave.k[ray, : wave.count[ray]].tolist()
-        taken = _groups(k, optical[ray].tolist(), float(random[ray]))
-        looks[ray], groups = taken
-        count[ray] = len(groups)
-        more = int(wave.next[ray]) <= int(last[ray]) or looks[ray] < wave.count[ray]
-        ended[ray] = more or sum(length for _, length in groups) < looks[ray]
-        for slot, (place, length) in enumerate(groups):
-            slots[ray, slot], steps[ray, slot] = place, length
-    slots = slots.to(wave.k.device)
-    row = torch.arange(rays, device=slots.device)[:, None]
-    kept = (wave.k, wave.triangle, wave.barycentric, wave.canonical, wave.distance)
-    k_out, *others = (values[row, slots] for values in kept)
-    return Picks(count, looks, ended, k_out, steps, *others)
+    rays, device = len(origins), origins.device
+    density_of = torch.cat([guide.reshape(-1), guide.new_full((1,), -1.0)])  # -1: no cell
+    count, looks = (torch.zeros(rays, dtype=torch.int64, device=device) for _ in range(2))
+    begin, length, following = torch.zeros_like(count), torch.zeros_like(count), first.long()
+    added, passed = torch.zeros_like(left), torch.zeros_like(left)
+    left, chance = left.clone(), chance.clone()
+    k_out = torch.full((rays, thrift.width), -1, dtype=torch.int64, device=device)
+    steps = torch.zeros_like(k_out)
+    going = last >= first
+
+    def close(which: torch.Tensor) -> None:
+        row = which.nonzero()[:, 0]
+        place = (chance[row] * length[row]).long().clamp(max=length[row] - 1)
+        k_out[row, count[row]] = begin[row] + place
+        steps[row, count[row]] = length[row]
+        count[row] += 1
+        chance[row] = (chance[row] + GOLDEN) % 1.0
+        length[row] = 0
+
+    ks = range(int(first.min()), int(last.max()) + 1) if rays else ()
+    for k in ks:
+        here = going & (first <= k) & (k <= last)
+        t = (k + jitter) * step
+        density = density_of[_cells(voxels, origins + t[:, None] * directions)]
+        seen = here & (density >= thrift.least) & (density >= 0)
+        alpha = -torch.expm1(-density * step)
+        more = left * alpha
+        together = seen & (length > 0) & (begin + length == k) & (length < thrift.longest)
+        together &= added + more <= thrift.share
+        opens = seen & ~together
+        close(opens & (length > 0))
+        full = opens & (count == thrift.width)
+        going &= ~full
+        opens &= ~full
+        seen &= ~full
+        begin = torch.where(opens, k, begin)
+        length = torch.where(opens, 1, length + together)
+        added = torch.where(opens, more, added + torch.where(together, more, 0.0))
+        if math.isfinite(thrift.opaque):
+            left = torch.where(seen, left - more, left)
+        passed = passed + torch.where(seen, density * step, 0.0)
+        looks += seen
+        following = torch.where(here & ~full, k + 1, following)
+        going &= passed <= thrift.opaque
+    close(length > 0)
+    finished = following > last
+    following = torch.where(finished, torch.maximum(last + 1, first), following)
+    rays_of = origins, directions, jitter, step
+    return _located(mesh, *rays_of, clearance, band, count, looks, following, k_out, steps)
 
 
-def _groups(k: list[int], optical: list[float], chance: float) -> tuple[int, list[tuple[int, int]]]:
-    """Places looked at on one ray, and its samples: (place, how many it stands for)."""
-    passed, looks = 0.0, 0
-    while looks < len(k) and passed <= OPAQUE:
-        passed += optical[looks]
-        looks += 1
-    found: list[tuple[int, int]] = []
-    place, left = 0, 1.0
-    while place < looks and len(found) < WIDTH:
-        added = left * -math.expm1(-optical[place])
-        length = 1
-        while length < LONGEST and place + length < looks:
-            if k[place + length] != k[place] + length:
-                break  # a gap
-            more = (left - added) * -math.expm1(-optical[place + length])
-            if added + more > SHARE:
-                break
-            added, length = added + more, length + 1
-        left -= added
-        found.append((place + min(int(chance * length), length - 1), length))
-        chance = (chance + _GOLDEN) % 1.0
-        place += length
-    return looks, found
+def _cells(voxels: Voxels, points: torch.Tensor) -> torch.Tensor:
+    """Canonical cell of each posed point [N, 3], or -1."""
+    size = len(voxels.bricks)
+    place = (points - voxels.box_min) * voxels.scale
+    inside = ((place >= 0) & (place < size)).all(1)
+    brick = torch.where(inside[:, None], place.floor(), 0.0)
+    within = ((torch.where(inside[:, None], place, 0.0) - brick) * BRICK).long()
+    row = voxels.bricks[brick.long().unbind(1)].long()
+    if len(voxels.cells) == 0:
+        return torch.full_like(row, -1)
+    cell = voxels.cells[row.clamp(min=0), within[:, 0], within[:, 1], within[:, 2]].long()
+    return torch.where(inside & (row >= 0), cell, -1)
+
+
+def _located(
+    mesh: PosedMesh,
+    origins: torch.Tensor,
+    directions: torch.Tensor,
+    jitter: torch.Tensor,
+    step: float,
+    clearance: Clearance,
+    band: float,
+    count: torch.Tensor,
+    looks: torch.Tensor,
+    following: torch.Tensor,
+    k: torch.Tensor,
+    steps: torch.Tensor,
+) -> Picks:
+    """Where the chosen places lie; those that lie nowhere are taken out."""
+    used = torch.arange(k.shape[1], device=k.device) < count[:, None]
+    ray, slot = used.nonzero().unbind(1)
+    t = (k[ray, slot].to(origins.dtype) + jitter[ray]) * step
+    points = origins[ray] + t[:, None] * directions[ray]
+    triangle, barycentric, distance = nearest(mesh.search, points)
+    canonical = canonicalise(points, triangle, barycentric, mesh)
+    keep = (triangle >= 0) & (distance <= band) & occupied(canonical, clearance)
+    ray, slot = ray[keep], slot[keep]
+    kept = torch.bincount(ray, minlength=len(k))
+    place = torch.arange(len(ray), device=k.device) - (torch.cumsum(kept, 0) - kept)[ray]
+
+    def spread(values: torch.Tensor, kind: torch.dtype) -> torch.Tensor:
+        out = torch.zeros((*k.shape, *values.shape[1:]), dtype=kind, device=k.device)
+        out[ray, place] = values.to(kind)
+        return out
+
+    whole, real = torch.int32, origins.dtype
+    return Picks(
+        kept.to(whole),
+        looks.to(whole),
+        following.to(whole),
+        spread(k[ray, slot], whole),
+        spread(steps[ray, slot], whole),
+        spread(triangle[keep], whole),
+        spread(barycentric[keep], real),
+        spread(canonical[keep], real),
+        spread(distance[keep], real),
+    )
+
+
+def cells_from_occupied(canonical: torch.Tensor, space: Clearance) -> torch.Tensor:
+    """How many cells canonical points [N, 3] are from an occupied one, chessboard distance [N]."""
+    return _in_grid(canonical, space)[1]
+
+
+def _in_grid(canonical: torch.Tensor, space: Clearance) -> tuple[torch.Tensor, torch.Tensor]:
+    """Flat cell of canonical points [N, 3], and how many cells the nearest occupied one is off."""
+    size = space.grid.shape[0]
+    place = ((canonical - space.box_min) * (space.box_scale * size)).floor()
+    cell = place.clamp(0, size - 1)
+    outside = (cell - place).abs().amax(1)
+    x, y, z = cell.long().unbind(1)
+    flat = (x * size + y) * size + z
+    return flat, space.grid.view(-1)[flat].float().maximum(outside)
+
+
+def brick_cells(
+    canonical: torch.Tensor, maps: torch.Tensor, space: Clearance, voxel: float
+) -> torch.Tensor:
+    """Canonical cells [N, 64] int32 of the voxels of bricks, -1 where no occupied cell is beside.
+
+    canonical [N, 3]: where the bricks' middles lie; maps [N, 3, 3]: the linear part of the map
+    there, which is taken to hold over the brick; voxel: side in metres.
+    """
+    within = torch.cartesian_prod(*[torch.arange(BRICK, device=canonical.device)] * 3)
+    offsets = (within + 0.5 - BRICK / 2) * voxel
+    around = canonical[:, None] + offsets @ maps.mT
+    cells, clear = _in_grid(around.view(-1, 3), space)
+    return torch.where(clear <= 1, cells, -1).int().view(-1, BRICK**3)
 
 
 def follow(guide: torch.Tensor, cells: torch.Tensor, density: torch.Tensor) -> None:

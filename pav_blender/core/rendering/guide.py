@@ -1,0 +1,38 @@
+"""What density a trained avatar has in every canonical cell: how rays know where to look."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from ..deformation import Deformer
+from ..field.avatar import Avatar
+from ..field.field import Samples, Worn, condition
+
+# one place in a cell each, and how the head is turned (axis times sine)
+_TURNS = ((0.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, -0.5, 0.0), (0.3, 0.0, 0.0))
+
+
+def guide(avatar: Avatar, deformer: Deformer, worn: Worn, occupied: np.ndarray) -> torch.Tensor:
+    """The greatest density (1/m) that was found in each cell [G, G, G] of those `occupied`, for the
+    only appearance in `worn`; in those beside them, that of their neighbours; 0 elsewhere."""
+    count = occupied.shape[0]
+    cells = torch.from_numpy(np.argwhere(occupied).astype(np.float32))
+    mesh = deformer.pose(avatar.canonical_vertices)
+    generator = torch.Generator().manual_seed(0)
+    found = torch.zeros(len(cells))
+    for turn in _TURNS:
+        unit = (cells + torch.rand(cells.shape, generator=generator)) / count
+        points = unit * avatar.box_size + torch.from_numpy(avatar.box_min)
+        triangle, barycentric, distance = deformer.nearest(mesh, points)
+        still = np.zeros(len(avatar.expression_names), np.float32)
+        zeros = torch.zeros(len(cells), dtype=torch.int32)
+        samples = Samples(
+            unit, triangle, barycentric, distance, zeros, zeros, zeros,
+            condition(avatar.config, still, np.array(turn, np.float32))[None], torch.zeros(1, 3),
+        )  # fmt: skip
+        found = torch.maximum(found, avatar.field.geometry(samples, worn)[0])
+    grid = torch.zeros(1, 1, count, count, count)
+    grid[0, 0][torch.from_numpy(occupied)] = found
+    spread = torch.nn.functional.max_pool3d(grid, 3, 1, 1)[0, 0]
+    return spread
