@@ -21,6 +21,7 @@ VERBS = {
     "train": "train an avatar on a collection",
     "render": "render an avatar along a track to an image sequence",
     "scene": "build a Blender scene of an avatar on a track",
+    "bench": "measure speed against error: render, train, kernels, scale",
     "info": "what an avatar file holds",
     "doctor": "what this machine offers: packages, versions, threads",
 }

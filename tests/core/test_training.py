@@ -18,7 +18,7 @@ from pav_blender.core.rendering.render import RenderSettings, pose_scene
 from pav_blender.core.training.batches import draw_pixels, pick_samples
 from pav_blender.core.training.checkpoint import checkpoint_path
 from pav_blender.core.training.frames import halved
-from pav_blender.core.training.losses import losses
+from pav_blender.core.training.losses import distortion, losses
 from pav_blender.core.training.prepare import load_training_frames, new_avatar
 from pav_blender.core.training.train import train
 from pav_blender.core.training.trainer import Trainer
@@ -274,3 +274,20 @@ def test_scores_compare_with_the_frames_own_picture(toy, toy_avatar):
     assert [s.appearance for s in scores] == toy.appearances
     worn = score(toy_avatar, scores[0].frame, "bushy", RenderSettings())
     assert worn.psnr < scores[0].psnr
+
+
+def test_distortion_is_the_sum_over_pairs_and_learns():
+    generator = torch.Generator().manual_seed(0)
+    ray = torch.tensor([0, 0, 0, 2, 2, 2, 2, 3], dtype=torch.int32)  # ray 1 has no sample
+    t = torch.rand(8, generator=generator, dtype=torch.float64).cumsum(0)
+    weights = torch.rand(8, generator=generator, dtype=torch.float64, requires_grad=True)
+    want = sum(
+        weights[i] * weights[j] * (t[i] - t[j]).abs()
+        for i in range(8)
+        for j in range(8)
+        if ray[i] == ray[j]
+    )
+    torch.testing.assert_close(distortion(weights, t, ray, 4), want / 4)
+    assert torch.autograd.gradcheck(lambda w: distortion(w, t, ray, 4), (weights,))
+    none = torch.zeros(0)
+    assert distortion(none, none, none.int(), 3) == 0

@@ -11,9 +11,13 @@ functions. Code that computes asks for one of them and never names it:
 
 from __future__ import annotations
 
+import contextlib
 import importlib
+from collections.abc import Iterator
 from types import ModuleType
 from typing import Any
+
+_plain = False
 
 MODULES = ("nearest", "encoding", "mlp", "marching", "picking", "optimiser")
 
@@ -25,5 +29,19 @@ def select(device: Any = "cpu", *, reference: bool = False) -> ModuleType:
     the reference; `reference=True` asks for it on the CPU too. numba is imported only when the
     compiled kernels are chosen, and each submodule only when it is first touched.
     """
-    compiled = str(device).split(":")[0] == "cpu" and not reference
+    compiled = str(device).split(":")[0] == "cpu" and not (reference or _plain)
     return importlib.import_module(f"{__name__}.{'cpu' if compiled else 'reference'}")
+
+
+@contextlib.contextmanager
+def plain_torch() -> Iterator[None]:
+    """Within it every choice is the reference: for measuring what the compiled kernels are worth.
+
+    What was made outside for the compiled kernels (a posed mesh) does not fit.
+    """
+    global _plain
+    _plain = True
+    try:
+        yield
+    finally:
+        _plain = False

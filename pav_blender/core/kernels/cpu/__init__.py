@@ -80,9 +80,24 @@ def _set_cache() -> None:
 
 
 _set_cache()
+_told = False
+
+
+def _tell_of_compiling() -> None:
+    """The first use on a machine takes long: nobody shall wonder why."""
+    global _told
+    if not _told and not any(Path(os.environ["NUMBA_CACHE_DIR"]).rglob("*.nbi")):
+        print(
+            "pav: compiling kernels for this processor, once; it takes about half a minute",
+            file=sys.stderr,
+            flush=True,
+        )
+    _told = True
 
 
 def __getattr__(name: str) -> Any:
     if name in (*MODULES, "threads"):
+        if name in MODULES:
+            _tell_of_compiling()
         return importlib.import_module(f"{__name__}.{name}")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

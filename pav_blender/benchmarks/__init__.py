@@ -1,0 +1,1 @@
+"""What things cost and how right they are: `pav bench NAME`, one module a question."""

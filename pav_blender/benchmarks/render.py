@@ -1,0 +1,259 @@
+"""Run time against error: every setting of a picture, the dense picture, plain torch, Cycles."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..core.errors import PavError
+from ..core.evaluation.metrics import over, psnr
+from ..core.evaluation.report import Claim
+from ..core.field.avatar import Avatar
+from ..core.progress import Report
+from ..core.rendering.render import Picture, RenderSettings, render
+from ..core.training.frames import Frame
+from .measure import Options, a_frame, best, plot, show, subject
+from .plain import dense
+
+_PLAIN_PIXELS = 48
+_FINAL = RenderSettings.preset("final")
+_PREVIEW = RenderSettings.preset("preview")
+# switch, what is changed to turn it off
+SKIPS = {
+    "empty voxels and thin places": {"skip": False},
+    "thin places": {"least": 0.0},
+    "places taken together": {"longest": 1},
+    "opaque rays": {"transmittance": 0.0},
+    "colours that hardly show": {"negligible": 0.0},
+}
+
+
+def run(options: Options, progress: Report | None = None) -> tuple[dict[str, Any], list[Claim]]:
+    avatar, collection = subject(options, progress)
+    frame = a_frame(collection)
+    points, skips = [], []
+    exact = {}
+    for size in (256, 512):
+        truth = _picture(avatar, frame, size, RenderSettings.preset("reference"))
+        exact[size] = truth
+        points += _points(avatar, frame, size, truth, options.repeats)
+        if size == 256:
+            skips = _skips(avatar, frame, size, truth, options.repeats)
+    show(points)
+    show(skips)
+    agreement = _against_plain(avatar, frame, exact[frame.camera.width])
+    print(f"reference preset against plain torch, {_PLAIN_PIXELS} pixels: {agreement:.1f} dB")
+    cold = {name: _cold_start(options.out / "subject.pav", name == "cached") for name in _CACHES}
+    named = {(p["size"], p["name"]): p for p in points}
+    final, preview = named[512, "final"], named[256, "preview"]
+    cycles = _cycles(512)
+    plot(
+        options.out / "render.svg",
+        lambda axes: _draw(axes, points, cycles),
+        "Run time against error (PSNR to the dense picture)",
+        "seconds a picture",
+        "dB",
+    )
+    fields = {
+        "points": points,
+        "skips": skips,
+        "plain_torch_psnr": round(agreement, 2),
+        "cold_start_seconds": cold,
+        "cycles_seconds": cycles,
+    }
+    claims = [
+        Claim.at_most("512 final: time", final["seconds"], 0.40, "s"),
+        Claim.at_least("512 final: to the dense picture", final["psnr"], 50, "dB"),
+        Claim.at_most("256 preview: time", preview["seconds"], 0.06, "s"),
+        Claim.at_least("256 preview: to the dense picture", preview["psnr"], 40, "dB"),
+        Claim.at_least("dense picture: to plain torch", agreement, 50, "dB"),
+        Claim.at_most("density evaluations a pixel, 512 final", final["evaluations"], 6, ""),
+        Claim.at_least("faster than Cycles, 512", cycles / final["seconds"], 12, "x"),
+        Claim.at_most("first picture, kernels cached", cold["cached"], 3, "s"),
+        Claim.at_most("first picture, kernels not cached", cold["compiled"], 30, "s"),
+    ]
+    return fields, claims
+
+
+def _picture(avatar: Avatar, frame: Frame, size: int, settings: RenderSettings) -> Picture:
+    camera = frame.camera.resized(size, size)
+    name = avatar.appearances[frame.appearance]
+    return render(avatar, frame.vertices, camera, name, settings, expression=frame.expression)
+
+
+def _variants() -> dict[str, RenderSettings]:
+    change = dataclasses.replace
+    found = {"preview": _PREVIEW, "final": _FINAL}
+    for step in (0.75, 1.0, 2.0, 3.0, 4.0):
+        found[f"step {step:g} mm"] = change(_FINAL, step=step * 1e-3)
+    for left in (1e-4, 1e-2, 3e-2):
+        found[f"transmittance {left:g}"] = change(_FINAL, transmittance=left)
+    for least in (0.0, 1.0, 3.0):
+        found[f"least {least:g} /m"] = change(_FINAL, least=least)
+    for share in (0.0, 0.05, 0.1):
+        found[f"share {share:g}"] = change(_FINAL, share=share)
+    return found
+
+
+class _Counted:
+    """Counts density evaluations of an avatar while it holds."""
+
+    def __init__(self, avatar: Avatar) -> None:
+        self._field, self.count = avatar.field, 0
+
+    def __enter__(self) -> _Counted:
+        geometry = self._field.geometry
+
+        def counted(samples: Any, *rest: Any) -> Any:
+            self.count += len(samples.canonical)
+            return geometry(samples, *rest)
+
+        self._field.geometry = counted  # type: ignore[assignment]
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        del self._field.geometry
+
+
+def _point(
+    avatar: Avatar, frame: Frame, size: int, settings: RenderSettings, truth: Picture, name: str
+) -> dict[str, Any]:
+    with _Counted(avatar) as counted:
+        picture = _picture(avatar, frame, size, settings)
+    return {
+        "name": name,
+        "size": size,
+        "seconds": 0.0,
+        "psnr": round(psnr(over(picture.rgba, 1.0), over(truth.rgba, 1.0)), 2),
+        "evaluations": round(counted.count / size**2, 2),
+    }
+
+
+def _timed(
+    avatar: Avatar,
+    frame: Frame,
+    size: int,
+    truth: Picture,
+    variants: dict[str, RenderSettings],
+    repeats: int,
+) -> list[dict[str, Any]]:
+    rows = [_point(avatar, frame, size, s, truth, n) for n, s in variants.items()]
+    calls = {n: partial(_picture, avatar, frame, size, s) for n, s in variants.items()}
+    seconds = best(calls, repeats)
+    for row in rows:
+        row["seconds"] = round(seconds[row["name"]], 4)
+    return rows
+
+
+def _points(
+    avatar: Avatar, frame: Frame, size: int, truth: Picture, repeats: int
+) -> list[dict[str, Any]]:
+    return _timed(avatar, frame, size, truth, _variants(), repeats)
+
+
+def _skips(
+    avatar: Avatar, frame: Frame, size: int, truth: Picture, repeats: int
+) -> list[dict[str, Any]]:
+    """The final preset, and with each skip off."""
+    variants = {"final": _FINAL}
+    for name, change in SKIPS.items():
+        variants[f"without: {name}"] = dataclasses.replace(_FINAL, **change)  # type: ignore[arg-type]
+    return _timed(avatar, frame, size, truth, variants, repeats)
+
+
+def _against_plain(avatar: Avatar, frame: Frame, exact: Picture) -> float:
+    """PSNR of the reference preset to plain torch over pixels of the person."""
+    inside = np.flatnonzero(frame.rgba[..., 3].reshape(-1) > 127)
+    pixels = np.random.default_rng(0).choice(inside, _PLAIN_PIXELS, replace=False)
+    ours = over(exact.rgba, 1.0).reshape(-1, 3)[pixels]
+    return psnr(ours, dense(avatar, frame, pixels))
+
+
+_CACHES = ("cached", "compiled")
+_FIRST_PICTURE = """
+import sys
+from pav_blender.core.collection import read_collection
+from pav_blender.core.field.avatar import Avatar
+from pav_blender.core.evaluation.heldout import chosen_frames
+from pav_blender.core.rendering.render import RenderSettings, render
+avatar, collection = Avatar.load(sys.argv[1]), read_collection(sys.argv[2])
+frame = chosen_frames(collection, ("test",), 1)[0]
+settings = RenderSettings.preset("preview")
+render(avatar, frame.vertices, frame.camera, avatar.appearances[0], settings)
+"""
+
+
+def _cold_start(avatar: Path, cached: bool) -> float:
+    """Seconds from the start of a process to its first picture of 256 pixels, reading included."""
+    from .measure import STUDIO
+
+    package = str(Path(__file__).parents[2])
+    with tempfile.TemporaryDirectory() as empty:
+        environment = os.environ | {"PYTHONPATH": package}
+        if not cached:
+            environment["NUMBA_CACHE_DIR"] = empty
+        command = [sys.executable, "-c", _FIRST_PICTURE, str(avatar), str(STUDIO)]
+        started = time.perf_counter()
+        done = subprocess.run(command, env=environment, capture_output=True, text=True)
+        if done.returncode:
+            raise PavError(f"a first picture failed: {done.stderr.strip().splitlines()[-1]}")
+        return round(time.perf_counter() - started, 2)
+
+
+def _cycles(size: int) -> float:
+    """Seconds of one picture of the studio's own scene in Cycles: 64 samples, denoised."""
+    from ..core.head import builtin_head
+    from ..studio.appearances import APPEARANCES, build_scene
+    from ..studio.identity import identity
+    from ..studio.passes import Passes
+    from ..studio.person import build_person
+    from ..studio.render import plan, quiet
+
+    head = builtin_head()
+    person = build_person(head, identity(head, 0))
+    look = APPEARANCES[0]
+    shot = plan(person, look, 6, size, 0)[0]
+    scene = build_scene(person, look, 0)
+    passes = Passes(scene.scene, size, 64)
+    try:
+        scene.pose(shot.expression, shot.pose, shot.translation)
+        scene.aim(shot.intrinsics, shot.camera_to_world, size)
+        with quiet():
+            return round(best({"cycles": passes.colour}, 1)["cycles"], 2)
+    finally:
+        passes.close()
+        scene.close()
+
+
+def _draw(axes: Any, points: list[dict[str, Any]], cycles: float) -> None:
+    for size, marker in ((256, "o"), (512, "s")):
+        own = [p for p in points if p["size"] == size]
+        axes.scatter([p["seconds"] for p in own], [p["psnr"] for p in own], s=22, marker=marker,
+                     label=f"{size} x {size}")  # fmt: skip
+        front = sorted(_front(own), key=lambda p: p["seconds"])
+        axes.plot([p["seconds"] for p in front], [p["psnr"] for p in front], linewidth=0.8)
+        for p in own:
+            if p["name"] in ("preview", "final"):
+                axes.annotate(p["name"], (p["seconds"], p["psnr"]), xytext=(4, -10),
+                              textcoords="offset points", fontsize=8)  # fmt: skip
+    axes.axvline(cycles, color="grey", linestyle="--", label="Cycles, 512 x 512")
+    axes.set_xscale("log")
+    axes.legend()
+
+
+def _front(points: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Those that no other beats in both time and error."""
+    return [
+        p
+        for p in points
+        if not any(q["seconds"] < p["seconds"] and q["psnr"] > p["psnr"] for q in points)
+    ]

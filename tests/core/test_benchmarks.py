@@ -1,0 +1,108 @@
+"""What `pav bench` measures with: the plain oracle, the clock, the plots, the claims."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pav_blender.benchmarks import kernels as kernels_bench
+from pav_blender.benchmarks import scale
+from pav_blender.benchmarks.measure import Options, a_frame, best, collection_of, plot
+from pav_blender.benchmarks.plain import dense
+from pav_blender.benchmarks.render import SKIPS, _Counted, _front, _picture, _skips
+from pav_blender.core.errors import InputError
+from pav_blender.core.evaluation.metrics import over, psnr
+from pav_blender.core.rendering.render import RenderSettings
+
+
+def test_the_reference_preset_is_what_plain_torch_gives(toy, toy_avatar):
+    frame = a_frame(toy)
+    inside = np.flatnonzero(frame.rgba[..., 3].reshape(-1) > 127)
+    pixels = np.random.default_rng(0).choice(inside, 12, replace=False)
+    shown = _picture(toy_avatar, frame, frame.camera.width, RenderSettings.preset("reference"))
+    ours = over(shown.rgba, 1.0).reshape(-1, 3)[pixels]
+    assert ours.std() > 0.05
+    assert psnr(ours, dense(toy_avatar, frame, pixels)) > 45
+
+
+def test_every_skip_costs_less_than_it_hides(toy, toy_avatar):
+    frame = a_frame(toy)
+    truth = _picture(toy_avatar, frame, 64, RenderSettings(skip=False, transmittance=0.0))
+    rows = _skips(toy_avatar, frame, 64, truth, 1)
+    assert len(rows) == len(SKIPS) + 1
+    final, *without = rows
+    assert final["psnr"] > 45
+    assert all(row["evaluations"] >= 0.999 * final["evaluations"] for row in without)
+    assert max(row["evaluations"] for row in without) > 1.5 * final["evaluations"]
+
+
+def test_evaluations_are_counted_only_within(toy, toy_avatar):
+    frame = a_frame(toy)
+    with _Counted(toy_avatar) as counted:
+        _picture(toy_avatar, frame, 32, RenderSettings())
+    seen = counted.count
+    _picture(toy_avatar, frame, 32, RenderSettings())
+    assert counted.count == seen > 100
+
+
+def test_the_clock_takes_the_least_in_turns():
+    order = []
+    seconds = best({"a": lambda: order.append("a"), "b": lambda: order.append("b")}, 3)
+    assert order == ["a", "b"] * 4
+    assert 0 < seconds["a"] < 1
+
+
+def test_the_front_holds_what_nothing_beats():
+    points = [{"seconds": s, "psnr": p} for s, p in ((1, 40), (2, 50), (3, 45), (4, 60))]
+    assert [p["seconds"] for p in _front(points)] == [1, 2, 4]
+
+
+def test_an_exponent_is_the_slope_of_the_logarithms():
+    assert scale._exponent({"10": 3.0, "100": 30.0, "1000": 300.0}) == pytest.approx(1)
+    assert scale._exponent({"1": 2.0, "4": 4.0}) == pytest.approx(0.5)
+
+
+def test_a_plot_is_the_same_file_for_the_same_figures(tmp_path):
+    for name in ("a.svg", "b.svg"):
+        plot(tmp_path / name, lambda axes: axes.plot([1, 2], [3, 4]), "title", "x", "y")
+    assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()
+    assert "title" in (tmp_path / "a.svg").read_text()
+
+
+def test_kernels_are_measured_and_the_subject_kept(toy, tmp_path, capsys):
+    options = Options(tmp_path, toy.path, repeats=1, iterations=3)
+    fields, claims = kernels_bench.run(options)
+    made = (tmp_path / "subject.pav").stat().st_mtime_ns
+    assert {row["kernel"] for row in fields["kernels"]} >= {"hash encoding", "nearest triangle"}
+    assert len(claims) == len(fields["kernels"])
+    assert all(row["ns"] > 0 and row["floor_ns"] > 0 for row in fields["kernels"])
+    assert "hash encoding" in capsys.readouterr().out
+    assert (tmp_path / "kernels.svg").stat().st_size > 1000
+    kernels_bench.run(options)
+    assert (tmp_path / "subject.pav").stat().st_mtime_ns == made
+
+
+def test_no_collection_is_told(tmp_path):
+    with pytest.raises(InputError, match="no such collection"):
+        collection_of(Options(tmp_path, tmp_path / "none"))
+
+
+def test_compiling_is_announced_once(tmp_path):
+    code = "from pav_blender.core.kernels import select; select('cpu').optimiser"
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+
+    def said() -> str:
+        command = [sys.executable, "-c", code]
+        root = Path(__file__).parents[2]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=root)
+        assert done.returncode == 0, done.stderr
+        return done.stderr
+
+    assert said().count("compiling kernels") == 1
+    (tmp_path / "kernel.nbi").touch()
+    assert "compiling" not in said()
