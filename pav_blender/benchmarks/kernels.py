@@ -84,7 +84,7 @@ def _kernels(
     ops, field, config = kernels.select("cpu"), avatar.field, avatar.config
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(_N, 3, generator=generator) * 0.5 + 0.25
-    encoded = torch.rand(_N, field.layout.width, generator=generator)
+    encoded = torch.rand(_N, field.encoded_width, generator=generator)
     group = torch.zeros(_N, dtype=torch.int32)
     network, bias = field.density, torch.zeros(1, config.hidden)
     weights, biases = [w.detach() for w in network.weights], [b.detach() for b in network.biases]

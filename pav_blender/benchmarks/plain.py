@@ -7,7 +7,7 @@ import torch
 
 from ..core import kernels
 from ..core.deformation import Deformer
-from ..core.deformation.rigid import head_rotation, head_turn
+from ..core.deformation.rigid import stance
 from ..core.field.avatar import Avatar
 from ..core.field.field import condition
 from ..core.rendering.rays import camera_rays, pack, samples_of
@@ -28,9 +28,8 @@ def dense(avatar: Avatar, frame: Frame, pixels: np.ndarray, samples: int = 1024)
             avatar.canonical_vertices, avatar.triangles, avatar.config.frames, reference=True
         )
         mesh, space = deformer.pose(frame.vertices), space_of(avatar, rows)
-        meshes = avatar.canonical_vertices, frame.vertices, avatar.rigid_weights
-        rotation = head_rotation(*meshes)
-        seen = condition(avatar.config, frame.expression, head_turn(*meshes, rotation))
+        stands = stance(avatar.canonical_vertices, frame.vertices, avatar.rigid_weights)
+        seen = condition(avatar.config, frame.expression, stands.turn)
         worn = avatar.field.blend(torch.eye(len(avatar.appearances))[frame.appearance])
         ops = kernels.select("cpu").marching
         found = []
@@ -45,7 +44,7 @@ def dense(avatar: Avatar, frame: Frame, pixels: np.ndarray, samples: int = 1024)
                 wave=4 * samples, clearance=space, band=avatar.config.reach,
             )  # fmt: skip
             packed, _ = pack(wave, jitter, step)
-            taken = samples_of(packed, space, 0, seen, rays.directions, rotation)
+            taken = samples_of(packed, space, 0, seen, rays, stands)
             sigma, rgb = avatar.field(taken, worn)
             colour, opacity, _, _ = ops.composite(sigma, rgb, packed.t, step, taken.ray, len(part))
             found.append(colour + 1 - opacity[:, None])

@@ -127,6 +127,7 @@ def _samples(avatar: Avatar, count: int) -> Samples:
     triangles = len(avatar.triangles)
     return Samples(
         canonical=torch.rand(count, 3, generator=generator),
+        still=torch.rand(count, 3, generator=generator),
         triangle=torch.randint(0, triangles, (count,), generator=generator, dtype=torch.int32),
         barycentric=torch.full((count, 3), 1 / 3),
         distance=torch.rand(count, generator=generator) * 0.02,

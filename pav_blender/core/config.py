@@ -21,6 +21,9 @@ class Config:
     log2_entries: int = 18
     base_resolution: int = 16
     finest_resolution: int = 512
+    # as many more levels for the place that rests with the shoulders: collars and hair that lies
+    # on them do not turn with the skin they are nearest to
+    shoulder_levels: int = 6
 
     # appearance embedding (paper, Learned Appearance Embedding)
     appearance: Literal["vertex", "surface", "global", "none"] = "vertex"
@@ -97,6 +100,7 @@ class Config:
         return cls(
             levels=16,
             finest_resolution=2048,
+            shoulder_levels=0,
             density_layers=2,
             colour_layers=2,
             frames="rigid",

@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from pav_blender.core.deformation import Deformer, canonicalise, clearance, triangle_maps
-from pav_blender.core.deformation.rigid import head_rotation, head_turn
+from pav_blender.core.deformation.rigid import stance
 from pav_blender.core.errors import InputError
 from pav_blender.core.kernels import select
 
@@ -207,5 +207,8 @@ def test_the_heads_turn_is_against_the_shoulders_wherever_all_of_it_goes():
     everywhere *= np.sign(np.linalg.det(everywhere))
     for rotation, shift in ((np.eye(3), 0.0), (everywhere, 0.4)):
         moved = (posed @ rotation.T + shift).astype(np.float32)
-        found = head_turn(canonical, moved, weights, head_rotation(canonical, moved, weights))
-        np.testing.assert_allclose(found, [0, np.sin(angle), 0], atol=1e-5)
+        found = stance(canonical, moved, weights)
+        np.testing.assert_allclose(found.turn, [0, np.sin(angle), 0], atol=1e-5)
+        still = found.still(torch.from_numpy(moved)).numpy()
+        np.testing.assert_allclose(still[60:], canonical[60:], atol=1e-5)
+        assert np.abs(still[:60] - canonical[:60]).max() > 0.02

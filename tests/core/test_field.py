@@ -38,6 +38,7 @@ def make_samples(count=40, seed=0):
     direction = torch.nn.functional.normalize(torch.randn(count, 3, generator=g), dim=1)
     return Samples(
         canonical=torch.rand(count, 3, generator=g),
+        still=torch.rand(count, 3, generator=g),
         triangle=torch.randint(0, 2, (count,), generator=g, dtype=torch.int32),
         barycentric=barycentric / barycentric.sum(1, keepdim=True),
         distance=torch.rand(count, generator=g) * 0.02,
@@ -114,7 +115,7 @@ def test_expression_and_direction_enter_as_the_first_layers_inputs():
     field = make_field()
     samples = make_samples()
     with torch.no_grad():
-        encoded = torch.rand(40, field.layout.width)
+        encoded = torch.rand(40, field.encoded_width)
         folded = field.density(encoded, samples.condition, samples.frame)
         weight = torch.cat([field.density.weights[0], field.density.group_weight], 1)
         inputs = torch.cat([encoded, samples.condition[samples.frame.long()]], 1)

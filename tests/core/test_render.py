@@ -71,8 +71,30 @@ def test_leaving_out_what_hardly_shows_changes_next_to_nothing(toy_avatar, pose)
 
 def test_waves_and_chunks_do_not_show(toy_avatar, pose):
     usual = picture(toy_avatar, pose)
-    other = picture(toy_avatar, pose, settings=RenderSettings(wave=3, chunk=1000))
-    assert np.abs(over(usual.rgba, 1.0) - over(other.rgba, 1.0)).max() < 5e-3
+    chunks = picture(toy_avatar, pose, settings=RenderSettings(chunk=1000))
+    assert np.abs(over(usual.rgba, 1.0) - over(chunks.rgba, 1.0)).max() < 2e-3
+    # where a wave ends, places that would go together are parted
+    waves = picture(toy_avatar, pose, settings=RenderSettings(wave=3))
+    assert psnr(over(usual.rgba, 1.0), over(waves.rgba, 1.0)) > 48
+    single = RenderSettings(longest=1)
+    alone = [
+        picture(toy_avatar, pose, settings=dataclasses.replace(single, wave=w)) for w in (3, 9)
+    ]
+    assert np.abs(over(alone[0].rgba, 1.0) - over(alone[1].rgba, 1.0)).max() < 2e-3
+
+
+def test_a_picture_may_be_asked_for_only_by_its_thread(toy_avatar, pose):
+    import threading
+
+    asked = set()
+
+    def ask(*_):
+        asked.add(threading.get_ident())
+        return False
+
+    settings = RenderSettings(chunk=256)
+    picture(toy_avatar, pose, settings=settings, should_stop=ask, progress=ask)
+    assert asked == {threading.get_ident()}
 
 
 def test_finer_steps_come_closer_to_the_dense_reference(toy_avatar, pose):

@@ -33,13 +33,15 @@ from . import directions
 class Samples:
     """N points to evaluate, packed; see the module's conventions for indices.
 
-    canonical [N, 3] in the field's unit box; triangle [N] int32; barycentric [N, 3];
+    canonical [N, 3] in the field's unit box; still [N, 3] there too, but carried along with the
+    shoulders (`deformation.rigid.Stance`); triangle [N] int32; barycentric [N, 3];
     distance [N], metres from the posed mesh;
     appearance [N] int32, frame [N] int32, ray [N] int32 (rows of what follows);
     condition [frames, E] (see `condition`); direction [rays, 3], unit, in the head's own axes.
     """
 
     canonical: torch.Tensor
+    still: torch.Tensor
     triangle: torch.Tensor
     barycentric: torch.Tensor
     distance: torch.Tensor
@@ -57,7 +59,7 @@ def condition(
     config: Config, expression: np.ndarray | torch.Tensor, turn: np.ndarray
 ) -> torch.Tensor:
     """What the density depends on besides the place: of the expression [E] and the head's turn [3]
-    (`deformation.rigid.head_turn`) what the settings let it see."""
+    (`deformation.rigid.Stance`) what the settings let it see."""
     seen = torch.as_tensor(expression).float() if config.sees_expression else torch.empty(0)
     return torch.cat([seen, torch.from_numpy(turn)]) if config.sees_turn else seen
 
@@ -124,6 +126,17 @@ class Field(nn.Module):
         self.register_buffer("corner_uvs", corner_uvs.float().contiguous(), persistent=False)
         tables = torch.empty(self.layout.entries, FEATURES)
         self.tables = nn.Parameter(nn.init.uniform_(tables, -1e-4, 1e-4))
+        # what rests on the shoulders has features of its own, where a turning head moves nothing
+        self.still_layout: Layout | None = None
+        if config.shoulder_levels:
+            self.still_layout = Layout(
+                config.shoulder_levels,
+                config.log2_entries,
+                config.base_resolution,
+                config.finest_resolution,
+            )
+            tables = torch.empty(self.still_layout.entries, FEATURES)
+            self.still_tables = nn.Parameter(nn.init.uniform_(tables, -1e-4, 1e-4))
         shape = {
             "vertex": (appearances, vertices, config.latent_channels),
             "surface": (
@@ -144,7 +157,7 @@ class Field(nn.Module):
         embedding, geometry = config.embedding_channels, config.geometry_channels
         conditions = config.sees_expression * expressions + config.sees_turn * TURN
         self.density = Mlp(
-            self.layout.width, conditions, config.hidden, config.density_layers, geometry
+            self.encoded_width, conditions, config.hidden, config.density_layers, geometry
         )
         self.offset: Mlp | None = None
         if config.density_offset and embedding:
@@ -177,10 +190,19 @@ class Field(nn.Module):
             return features
         return features + worn.code[samples.appearance.long()]
 
+    @property
+    def encoded_width(self) -> int:
+        """Features of an encoded sample."""
+        return self.layout.width + (self.still_layout.width if self.still_layout else 0)
+
     def encode(self, samples: Samples) -> torch.Tensor:
-        """phi(x_c) [N, levels * 2]."""
-        ops = kernels.select(self.tables.device)
-        return ops.encoding.encode(samples.canonical, self.tables, self.layout)
+        """phi(x_c), and that of the place that rests with the shoulders, [N, encoded_width]."""
+        encode = kernels.select(self.tables.device).encoding.encode
+        features = encode(samples.canonical, self.tables, self.layout)
+        if self.still_layout is None:
+            return features
+        still = encode(samples.still, self.still_tables, self.still_layout)
+        return torch.cat([features, still], 1)
 
     def geometry(
         self, samples: Samples, worn: Worn | None = None, encoded: torch.Tensor | None = None

@@ -28,7 +28,7 @@ def guide(avatar: Avatar, deformer: Deformer, worn: Worn, occupied: np.ndarray) 
         still = np.zeros(len(avatar.expression_names), np.float32)
         zeros = torch.zeros(len(cells), dtype=torch.int32)
         samples = Samples(
-            unit, triangle, barycentric, distance, zeros, zeros, zeros,
+            unit, unit, triangle, barycentric, distance, zeros, zeros, zeros,
             condition(avatar.config, still, np.array(turn, np.float32))[None], torch.zeros(1, 3),
         )  # fmt: skip
         found = torch.maximum(found, avatar.field.geometry(samples, worn)[0])

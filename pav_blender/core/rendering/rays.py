@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from ..deformation import Clearance
+from ..deformation.rigid import Stance
 from ..field.field import Samples
 from ..kernels.structures import Picks, Wave
 from .cameras import Camera
@@ -82,20 +83,27 @@ def pack(wave: Wave | Picks, jitter: torch.Tensor, step: float) -> tuple[Packed,
     return packed, slots
 
 
+def still_of(packed: Packed, clearance: Clearance, rays: RayBatch, stance: Stance) -> torch.Tensor:
+    """Where samples [N, 3] lie in the unit box if the shoulders carry them."""
+    ray = packed.ray.long()
+    points = rays.origins[ray] + packed.t[:, None] * rays.directions[ray]
+    return (stance.still(points) - clearance.box_min) * clearance.box_scale
+
+
 def samples_of(
     packed: Packed,
     clearance: Clearance,
     appearance: int,
     condition: torch.Tensor,
-    directions: torch.Tensor,
-    head_rotation: np.ndarray,
+    rays: RayBatch,
+    stance: Stance,
 ) -> Samples:
-    """What the field needs for samples of one frame; condition [E] as `field.condition` made it,
-    ray directions [R, 3]."""
+    """What the field needs for samples of one frame; condition [E] as `field.condition` made it."""
     count = len(packed)
-    turned = directions @ torch.from_numpy(head_rotation)
+    turned = rays.directions @ torch.from_numpy(stance.rotation)
     return Samples(
         canonical=(packed.canonical - clearance.box_min) * clearance.box_scale,
+        still=still_of(packed, clearance, rays, stance),
         triangle=packed.triangle,
         barycentric=packed.barycentric,
         distance=packed.distance,

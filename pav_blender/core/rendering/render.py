@@ -12,7 +12,7 @@ import torch
 
 from .. import kernels
 from ..deformation import Clearance, Deformer, PosedMesh, Thrift, Voxels, clearance, voxels
-from ..deformation.rigid import head_rotation, head_turn
+from ..deformation.rigid import Stance, stance
 from ..errors import Cancelled, InputError
 from ..field.avatar import Avatar
 from ..field.field import Worn, condition
@@ -76,7 +76,7 @@ class Scene:
     clearance: Clearance
     voxels: Voxels
     guide: torch.Tensor
-    rotation: np.ndarray
+    stance: Stance
     condition: torch.Tensor
     worn: Worn
 
@@ -162,8 +162,7 @@ def pose_scene(
     weights = appearance_weights(avatar, appearance)
     rows = tuple(int(i) for i in np.flatnonzero(weights))
     canonical = avatar.canonical_vertices
-    rotation = head_rotation(canonical, vertices, avatar.rigid_weights)
-    turn = head_turn(canonical, vertices, avatar.rigid_weights, rotation)
+    stands = stance(canonical, vertices, avatar.rigid_weights)
     mesh, space = deformer_of(avatar).pose(vertices), space_of(avatar, rows)
     return Scene(
         avatar,
@@ -171,8 +170,8 @@ def pose_scene(
         space,
         voxels(mesh, space, avatar.config.reach),
         guide_of(avatar, weights),
-        rotation,
-        condition(avatar.config, values.astype(np.float32), turn),
+        stands,
+        condition(avatar.config, values.astype(np.float32), stands.turn),
         avatar.field.blend(torch.from_numpy(weights)),
     )
 
@@ -243,9 +242,7 @@ def _trace(scene: Scene, rays: RayBatch, settings: RenderSettings) -> tuple[np.n
         wave = _wave(scene, part, first[alive], last[alive], left[alive], settings)
         packed, slots = pack(wave, jitter[alive], settings.step)
         if len(packed):
-            samples = samples_of(
-                packed, scene.clearance, 0, scene.condition, part.directions, scene.rotation
-            )
+            samples = samples_of(packed, scene.clearance, 0, scene.condition, part, scene.stance)
             sigma, inputs = field.geometry(samples, scene.worn)
             ray = alive[packed.ray.long()]
             width = torch.full_like(sigma, settings.step)

@@ -11,9 +11,9 @@ import torch
 from .. import kernels
 from ..config import Config
 from ..deformation import Clearance, Deformer, PosedMesh, Thrift, Voxels, voxels
-from ..deformation.rigid import head_rotation, head_turn
+from ..deformation.rigid import Stance, stance
 from ..field.field import Samples, condition
-from ..rendering.rays import Packed, RayBatch, camera_rays, pack
+from ..rendering.rays import Packed, RayBatch, camera_rays, pack, still_of
 from .frames import TILE, Frame
 from .occupancy import Visibility
 
@@ -52,14 +52,13 @@ class Picked:
 @dataclass(eq=False)
 class _Posed:
     mesh: PosedMesh
-    rotation: np.ndarray
-    turn: np.ndarray
+    stance: Stance
     voxels: Voxels
     version: int
 
 
 class Poses:
-    """Frames' posed meshes, head rotations and voxels, the most recently used ones kept.
+    """Frames' posed meshes, stances and voxels, the most recently used ones kept.
 
     Cells are only ever emptied, so that old voxels are still right, merely more than needed.
     """
@@ -74,9 +73,7 @@ class Poses:
         if known is None:
             mesh = self._deformer.pose(frame.vertices)
             meshes = self._canonical, frame.vertices, self._weights
-            rotation = head_rotation(*meshes)
-            turn = head_turn(*meshes, rotation)
-            known = _Posed(mesh, rotation, turn, voxels(mesh, space, reach), version)
+            known = _Posed(mesh, stance(*meshes), voxels(mesh, space, reach), version)
             self._kept[frame.name] = known
             if len(self._kept) > _KEPT_POSES:
                 self._kept.popitem(last=False)
@@ -150,7 +147,7 @@ def pick_samples(
     stops = [*pixels.starts[1:], count]
     jitter, chance = torch.rand(2, count, generator=generator)
     parts: list[Packed] = []
-    steps, directions, frame, ended, conditions = [], [], [], [], []
+    steps, directions, frame, ended, conditions, still = [], [], [], [], [], []
     looks = 0
     for index, (a, b) in enumerate(zip(pixels.starts, stops, strict=True)):
         appearance = pixels.frames[index].appearance
@@ -177,13 +174,15 @@ def pick_samples(
         looks += int(picks.looks.sum())
         ended.append(picks.next <= last)
         packed, slots = pack(picks, jitter[a:b], step)
+        own = RayBatch(*rays, pixels.rays.cosine[a:b])
+        still.append(still_of(packed, space, own, posed.stance))
         packed.ray += a
         parts.append(packed)
         steps.append(picks.steps.view(-1)[slots])
         frame.append(torch.full((len(packed),), index, dtype=torch.int32))
         expression = pixels.frames[index].expression
-        conditions.append(condition(config, expression, posed.turn))
-        directions.append(rays[1] @ torch.from_numpy(posed.rotation))
+        conditions.append(condition(config, expression, posed.stance.turn))
+        directions.append(rays[1] @ torch.from_numpy(posed.stance.rotation))
     fields = ("ray", "t", "triangle", "barycentric", "canonical", "distance")
     packed = Packed(*(torch.cat([getattr(p, name) for p in parts]) for name in fields))
     appearances = torch.tensor([f.appearance for f in pixels.frames], dtype=torch.int32)
@@ -191,6 +190,7 @@ def pick_samples(
     space = visibility.spaces[0]
     samples = Samples(
         canonical=(packed.canonical - space.box_min) * space.box_scale,
+        still=torch.cat(still),
         triangle=packed.triangle,
         barycentric=packed.barycentric,
         distance=packed.distance,

@@ -13,6 +13,7 @@ from .. import kernels
 from ..config import Config
 from ..deformation import Deformer
 from ..field.avatar import Avatar
+from ..field.field import Samples
 from .batches import Poses, draw_pixels, pick_samples
 from .frames import Frame, halved
 from .losses import Loss, distortion, losses
@@ -25,6 +26,7 @@ _CARVED = 0.5  # part of the schedule in which space is emptied often
 _PRUNE_EVERY = 50  # iterations, while there is much to empty
 _PRUNE_LATER = 200
 _WARM_UP = 20
+_TABLES = ("tables", "still_tables")
 # parts of the schedule until which pictures are a half and a quarter as large: there are more
 # pixels than an avatar's minutes have rays, and small ones tell the most each
 _COARSE = (0.4, 0.15)
@@ -71,7 +73,9 @@ class Trainer:
             for name, p in avatar.field.named_parameters()
         }
         # the tables' gradient never lies anywhere as a whole: see `encode_adam_step`
-        avatar.field.tables.requires_grad_(False)
+        for name in _TABLES:
+            if name in self.moments:
+                getattr(avatar.field, name).requires_grad_(False)
         self._mse = math.nan
 
     @property
@@ -104,7 +108,7 @@ class Trainer:
         if torch.isfinite(loss.total):
             spread = distortion(weights, picked.t, picked.samples.ray, count)
             (loss.total + config.distortion_weight * spread).backward()
-            self._adam(picked.samples.canonical, encoded)
+            self._adam(picked.samples, encoded)
             self.visibility.watch(picked.cells, sigma.detach(), weights.detach(), picked.width)
         status.iteration += 1
         if self._prunes_now():
@@ -142,7 +146,7 @@ class Trainer:
         every = _PRUNE_EVERY if often else _PRUNE_LATER
         return self.done > _PRUNE_FROM and self.status.iteration % every == 0
 
-    def _adam(self, points: torch.Tensor, encoded: torch.Tensor) -> None:
+    def _adam(self, samples: Samples, encoded: torch.Tensor) -> None:
         config, field = self.config, self.avatar.field
         ops = kernels.select("cpu")
         step = self.status.iteration + 1
@@ -151,6 +155,7 @@ class Trainer:
         rates = {
             "offset": config.offset_learning_rate,
             "tables": config.table_learning_rate,
+            "still_tables": config.table_learning_rate,
             "latent": config.latent_learning_rate,
             "code": config.latent_learning_rate,
         }
@@ -163,10 +168,15 @@ class Trainer:
                 "beta2": config.beta2,
                 "eps": config.epsilon,
             }
-            if name == "tables":
+            if name in _TABLES:
                 if encoded.grad is not None:
-                    state = parameter.data, m, v, field.layout
-                    ops.encoding.encode_adam_step(points, encoded.grad, *state, **settings)
+                    still = name == "still_tables"
+                    points = samples.still if still else samples.canonical
+                    layout = field.still_layout if still else field.layout
+                    width = field.layout.width
+                    part = encoded.grad[:, width:] if still else encoded.grad[:, :width]
+                    state = parameter.data, m, v, layout
+                    ops.encoding.encode_adam_step(points, part.contiguous(), *state, **settings)
                 continue
             grad = parameter.grad
             if grad is None or parameter.numel() == 0:

@@ -1,0 +1,53 @@
+"""The pool: every piece once, pieces within pieces on one thread, the first error out."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+
+from pav_blender.core.kernels.cpu.threads import run_chunks
+
+
+@pytest.fixture(autouse=True)
+def three_threads(monkeypatch):
+    monkeypatch.setenv("PAV_THREADS", "3")
+
+
+def test_every_index_is_in_one_piece():
+    seen = [0] * 1000
+
+    def count(start: int, stop: int) -> None:
+        for i in range(start, stop):
+            seen[i] += 1
+
+    run_chunks(count, 1000, 7)
+    assert seen == [1] * 1000
+
+
+def test_a_call_within_a_piece_stays_on_its_thread():
+    alone = []
+
+    def piece(start: int, stop: int) -> None:
+        inner = set()
+        run_chunks(lambda a, b: inner.add(threading.get_ident()), 50, 1)
+        alone.append(inner == {threading.get_ident()})
+
+    run_chunks(piece, 12, 1)
+    assert alone == [True] * 12
+
+
+def test_the_first_error_comes_out_and_the_pool_goes_on():
+    def fail(start: int, stop: int) -> None:
+        raise ValueError(f"piece {start}")
+
+    with pytest.raises(ValueError, match="piece"):
+        run_chunks(fail, 100, 1)
+    threads, barrier = set(), threading.Barrier(2, timeout=10)
+
+    def meet(start: int, stop: int) -> None:
+        threads.add(threading.get_ident())
+        barrier.wait()  # passes only if two threads are at work
+
+    run_chunks(meet, 2, 1)
+    assert len(threads) == 2
