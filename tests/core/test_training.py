@@ -124,7 +124,12 @@ def test_training_sees_a_frame_as_rendering_does(toy, frames, small_config):
     scene = pose_scene(avatar, frame.vertices, name, frame.expression)
     assert scene.condition[-3:].abs().max() > 0.01  # the head is turned
     torch.testing.assert_close(picked.samples.condition[0], scene.condition)
-    seen = pixels.rays.directions @ torch.from_numpy(scene.rotation)
+    ray = picked.samples.ray.long()
+    points = pixels.rays.origins[ray] + picked.t[:, None] * pixels.rays.directions[ray]
+    still = (scene.stance.still(points) - scene.clearance.box_min) * scene.clearance.box_scale
+    torch.testing.assert_close(picked.samples.still, still, rtol=0, atol=1e-5)
+    assert (still - picked.samples.canonical).abs().max() > 0.01  # they differ in the head
+    seen = pixels.rays.directions @ torch.from_numpy(scene.stance.rotation)
     torch.testing.assert_close(picked.samples.direction, seen)
     assert torch.equal(picked.samples.appearance.unique(), torch.tensor([frame.appearance]).int())
 
