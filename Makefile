@@ -8,6 +8,7 @@ OUT ?= out
 .PHONY: demo test test-all lint extension test-real-blender clean
 
 demo: $(VENV)/ready
+	$(RUN) -m pav_blender doctor --compile
 	$(RUN) -m pav_blender demo --out $(OUT)/demo --check
 
 test: $(VENV)/ready lint extension

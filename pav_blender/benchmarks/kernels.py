@@ -1,7 +1,7 @@
 """Each compiled kernel: nanoseconds a sample, against a floor from this machine's own rates.
 
 A floor is what the kernel must move or compute at least, at the rates that plain large operations
-reach here: multiply-adds of a matrix product, bytes of a copy, scattered reads of a table's rows.
+reach here: multiply-adds of a matrix product, bytes of a copy.
 """
 
 from __future__ import annotations
@@ -13,21 +13,22 @@ import numpy as np
 import torch
 
 from ..core import kernels
-from ..core.deformation import voxels
 from ..core.evaluation.report import Claim
 from ..core.progress import Report
-from ..core.rendering.render import deformer_of, pose_scene, space_of
+from ..core.rendering.render import deformer_of
 from .measure import Options, a_frame, best, plot, show, subject
 
 _N = 1 << 16  # samples
 _SIDE = 1024  # of the matrices that tell the rate of multiply-adds
+_CACHE = 1 << 20  # bytes a core keeps to itself
+_LINES = 4  # cache lines that the eight corners of a cell lie in
 _COPY = 1 << 25  # floats that tell the rate of memory
 _SEARCH_FLOPS = 1200  # of one search that opens one node a level and measures one leaf
 
 
 def run(options: Options, progress: Report | None = None) -> tuple[dict[str, Any], list[Claim]]:
     avatar, collection = subject(options, progress)
-    rates = _rates(avatar.field.tables, options.repeats)
+    rates = _rates(options.repeats)
     calls, floors = _kernels(avatar, a_frame(collection), rates)
     seconds = best(calls, options.repeats)
     rows = []
@@ -56,24 +57,21 @@ def run(options: Options, progress: Report | None = None) -> tuple[dict[str, Any
     return {"rates": rates, "kernels": rows}, claims
 
 
-def _rates(tables: torch.Tensor, repeats: int) -> dict[str, float]:
-    """Multiply-adds, bytes and scattered rows a nanosecond, all cores together."""
+def _rates(repeats: int) -> dict[str, float]:
+    """Multiply-adds and bytes a nanosecond, all cores together."""
     a, b = torch.rand(2, _SIDE, _SIDE)
     source, target = torch.rand(_COPY), torch.empty(_COPY)
-    rows = torch.randint(0, len(tables), (1 << 22,))
     with torch.inference_mode():
         seconds = best(
             {
                 "product": lambda: a @ b,
                 "copy": lambda: target.copy_(source),
-                "rows": lambda: tables.index_select(0, rows),
             },
             repeats + 2,
         )
     return {
         "multiply_adds_per_ns": round(_SIDE**3 / seconds["product"] * 1e-9, 2),
         "bytes_per_ns": round(8 * _COPY / seconds["copy"] * 1e-9, 2),
-        "rows_per_ns": round(len(rows) / seconds["rows"] * 1e-9, 3),
     }
 
 
@@ -101,20 +99,19 @@ def _kernels(
     adam = {"step": 10, "lr": 1e-3, "beta1": 0.9, "beta2": 0.99, "eps": 1e-15}
     trained = [w.clone().requires_grad_() for w in weights]
     shifts = [b.clone().requires_grad_() for b in biases]
-    space = space_of(avatar, (frame.appearance,))
-    scene = pose_scene(avatar, frame.vertices, avatar.appearances[frame.appearance])
-    held = int((scene.voxels.cells >= 0).sum())
 
     def forward() -> torch.Tensor:
         with torch.inference_mode():
             return ops.mlp.mlp(encoded, weights, biases, bias, group)
 
+    # a level that is larger than a core's own cache is read line by line: corners along one axis
+    # are neighbours
+    large = sum(8 * entries > _CACHE for entries in field.layout.sizes)
     outputs = torch.ones(_N, config.geometry_channels)
 
     def both() -> None:
         ops.mlp.mlp(encoded, trained, shifts, bias, group).backward(outputs)
 
-    gathers = 8 * config.levels / rates["rows_per_ns"]
     fma, byte = rates["multiply_adds_per_ns"], rates["bytes_per_ns"]
     calls: dict[str, Callable[[], Any]] = {
         "nearest triangle": lambda: ops.nearest.nearest(mesh.search, near),
@@ -123,16 +120,14 @@ def _kernels(
         "density network, forward and backward": both,
         "compositing": lambda: ops.marching.composite(sigma, colour, t, 1e-3, ray, _N // 8),
         "Adam": lambda: ops.optimiser.adam_step(table, grad, m, v, **adam),
-        "voxels of a pose": lambda: voxels(mesh, space, config.reach),
     }
     floors = {
         "nearest triangle": (_N, _SEARCH_FLOPS / 2 / fma, "one path down the tree"),
-        "hash encoding": (_N, gathers, "scattered reads of its rows"),
+        "hash encoding": (_N, _LINES * 64 * large / byte, "cache lines of its large levels"),
         "density network, forward": (_N, multiplies / fma, "multiply-adds"),
         "density network, forward and backward": (_N, 3 * multiplies / fma, "multiply-adds"),
         "compositing": (_N, 4 * (5 + 1) / byte, "bytes in and out"),
         "Adam": (len(table), 4 * 7 / byte, "bytes in and out"),
-        "voxels of a pose": (held, 4 * 4 / byte, "bytes in and out"),
     }
     return calls, floors
 

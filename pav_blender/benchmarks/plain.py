@@ -14,7 +14,7 @@ from ..core.rendering.rays import camera_rays, pack, samples_of
 from ..core.rendering.render import space_of
 from ..core.training.frames import Frame
 
-_RAYS = 8  # at once: every sample is held against every triangle
+_RAYS = 2  # at once: every sample is held against every triangle
 
 
 def dense(avatar: Avatar, frame: Frame, pixels: np.ndarray, samples: int = 1024) -> np.ndarray:

@@ -24,7 +24,8 @@ from ..core.training.frames import Frame
 from .measure import Options, a_frame, best, plot, show, subject
 from .plain import dense
 
-_PLAIN_PIXELS = 48
+_PLAIN_PIXELS = 6  # every sample is held against every triangle: minutes
+_DETAILED = 256  # pixels a side at which every setting is tried
 _FINAL = RenderSettings.preset("final")
 _PREVIEW = RenderSettings.preset("preview")
 # switch, what is changed to turn it off
@@ -46,7 +47,7 @@ def run(options: Options, progress: Report | None = None) -> tuple[dict[str, Any
         truth = _picture(avatar, frame, size, RenderSettings.preset("reference"))
         exact[size] = truth
         points += _points(avatar, frame, size, truth, options.repeats)
-        if size == 256:
+        if size == _DETAILED:
             skips = _skips(avatar, frame, size, truth, options.repeats)
     show(points)
     show(skips)
@@ -90,11 +91,13 @@ def _picture(avatar: Avatar, frame: Frame, size: int, settings: RenderSettings) 
     return render(avatar, frame.vertices, camera, name, settings, expression=frame.expression)
 
 
-def _variants() -> dict[str, RenderSettings]:
+def _variants(size: int) -> dict[str, RenderSettings]:
     change = dataclasses.replace
     found = {"preview": _PREVIEW, "final": _FINAL}
     for step in (0.75, 1.0, 2.0, 3.0, 4.0):
         found[f"step {step:g} mm"] = change(_FINAL, step=step * 1e-3)
+    if size != _DETAILED:
+        return found
     for left in (1e-4, 1e-2, 3e-2):
         found[f"transmittance {left:g}"] = change(_FINAL, transmittance=left)
     for least in (0.0, 1.0, 3.0):
@@ -157,7 +160,7 @@ def _timed(
 def _points(
     avatar: Avatar, frame: Frame, size: int, truth: Picture, repeats: int
 ) -> list[dict[str, Any]]:
-    return _timed(avatar, frame, size, truth, _variants(), repeats)
+    return _timed(avatar, frame, size, truth, _variants(size), repeats)
 
 
 def _skips(

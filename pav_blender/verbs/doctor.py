@@ -23,10 +23,15 @@ _DISTRIBUTIONS = {"skimage": "scikit-image", "OpenImageIO": "OpenImageIO"}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    pass
+    parser.add_argument(
+        "--compile", action="store_true", help="compile the kernels now instead of on first use"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
+    if args.compile:
+        print(f"kernels are compiled: {_compile():.0f} s")
+        return 0
     missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
     print(json.dumps({"machine": machine(), "versions": versions()}, indent=1))
     for name, use in OPTIONAL.items():
@@ -70,3 +75,33 @@ def _processor() -> str:
     except OSError:
         pass
     return platform.processor() or "unknown"
+
+
+def _compile() -> float:
+    """Trains and renders next to nothing, so that every kernel is compiled; seconds."""
+    import time
+
+    import numpy as np
+
+    from ..benchmarks.measure import STUDIO, Options, collection_of
+    from ..core.config import Config
+    from ..core.kernels.cpu.threads import torch_alone
+    from ..core.rendering.render import RenderSettings, render
+    from ..core.training.frames import load_frames
+    from ..core.training.prepare import new_avatar
+    from ..core.training.trainer import Trainer
+
+    started = time.monotonic()
+    collection = collection_of(Options(STUDIO, STUDIO))
+    frames = [f for c in collection.clips for f in load_frames(collection, c, np.arange(2))]
+    trainer = Trainer(new_avatar(collection, frames, Config()), frames)
+    with torch_alone():
+        for _ in range(3):
+            trainer.iterate()
+    trainer.visibility.prune()
+    frame, name = frames[0], collection.appearances[0]
+    for quality in ("preview", "reference"):
+        camera = frame.camera.resized(16, 16)
+        settings = RenderSettings.preset(quality)
+        render(trainer.avatar, frame.vertices, camera, name, settings)
+    return time.monotonic() - started

@@ -50,7 +50,7 @@ class RenderSettings:
     def preset(cls, name: str) -> RenderSettings:
         """ "preview" (fast), "final", "reference" (every sample, to the end of the ray)."""
         presets = {
-            "preview": cls(step=2.5e-3, transmittance=1e-2, least=1.0, share=0.05),
+            "preview": cls(step=3.5e-3, transmittance=1e-2, least=1.0, share=0.05),
             "final": cls(),
             "reference": cls(step=3.9e-4, transmittance=0.0, skip=False, negligible=0.0, wave=64),
         }
