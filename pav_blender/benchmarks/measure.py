@@ -17,8 +17,7 @@ from ..core.field.avatar import Avatar
 from ..core.progress import Report
 from ..core.training.frames import Frame
 from ..core.training.train import fingerprint, train
-
-STUDIO = Path(__file__).parents[2] / "data" / "studio3"
+from ..studio import DEFAULT_COLLECTION
 
 
 @dataclass(frozen=True)
@@ -27,13 +26,14 @@ class Options:
     of the subject's training, the same work on every machine."""
 
     out: Path
-    collection: Path = STUDIO
+    collection: Path = DEFAULT_COLLECTION
     repeats: int = 3
     minutes: float = 8.0
     iterations: int = 3000
 
 
 def collection_of(options: Options) -> Collection:
+    """The collection to measure on; InputError, saying how to make one, where there is none."""
     if not options.collection.is_dir():
         raise InputError(
             f"{options.collection}: no such collection; `pav studio DIR` makes one for --collection"
@@ -53,9 +53,9 @@ def subject(options: Options, progress: Report | None = None) -> tuple[Avatar, C
     return train(collection, path, config, progress=progress), collection
 
 
-def a_frame(collection: Collection, split: str = "test") -> Frame:
+def a_frame(collection: Collection) -> Frame:
     """One held-out frame: the middle one of the first appearance's."""
-    frames = chosen_frames(collection, (split,), None)
+    frames = chosen_frames(collection, ("test",), None)
     own = [f for f in frames if f.appearance == 0]
     return own[len(own) // 2]
 
@@ -91,8 +91,6 @@ def plot(path: Path, draw: Callable[[Any], None], title: str, x: str, y: str) ->
         import matplotlib
     except ImportError as error:
         raise InputError("plots need matplotlib: `pip install matplotlib`") from error
-    matplotlib.use("svg")
-    matplotlib.rcParams["svg.hashsalt"] = "pav"  # the same file for the same figures
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7, 4.5), layout="constrained")
@@ -100,4 +98,5 @@ def plot(path: Path, draw: Callable[[Any], None], title: str, x: str, y: str) ->
     draw(axes)
     axes.set(title=title, xlabel=x, ylabel=y)
     axes.grid(alpha=0.3)
-    figure.savefig(path, metadata={"Date": None})
+    with matplotlib.rc_context({"svg.hashsalt": "pav"}):  # the same file for the same figures
+        figure.savefig(path, metadata={"Date": None})

@@ -21,6 +21,7 @@ from ..core.field.avatar import Avatar
 from ..core.progress import Report
 from ..core.rendering.render import Picture, RenderSettings, render
 from ..core.training.frames import Frame
+from ..studio import DEFAULT_COLLECTION
 from .measure import Options, a_frame, best, plot, show, subject
 from .plain import dense
 
@@ -30,8 +31,7 @@ _FINAL = RenderSettings.preset("final")
 _PREVIEW = RenderSettings.preset("preview")
 # switch, what is changed to turn it off
 SKIPS = {
-    "empty voxels and thin places": {"skip": False},
-    "thin places": {"least": 0.0},
+    "voxels and their guide": {"skip": False},
     "places taken together": {"longest": 1},
     "opaque rays": {"transmittance": 0.0},
     "colours that hardly show": {"negligible": 0.0},
@@ -46,7 +46,7 @@ def run(options: Options, progress: Report | None = None) -> tuple[dict[str, Any
     for size in (256, 512):
         truth = _picture(avatar, frame, size, RenderSettings.preset("reference"))
         exact[size] = truth
-        points += _points(avatar, frame, size, truth, options.repeats)
+        points += _timed(avatar, frame, size, truth, _variants(size), options.repeats)
         if size == _DETAILED:
             skips = _skips(avatar, frame, size, truth, options.repeats)
     show(points)
@@ -100,8 +100,6 @@ def _variants(size: int) -> dict[str, RenderSettings]:
         return found
     for left in (1e-4, 1e-2, 3e-2):
         found[f"transmittance {left:g}"] = change(_FINAL, transmittance=left)
-    for least in (0.0, 1.0, 3.0):
-        found[f"least {least:g} /m"] = change(_FINAL, least=least)
     for share in (0.0, 0.05, 0.1):
         found[f"share {share:g}"] = change(_FINAL, share=share)
     return found
@@ -157,12 +155,6 @@ def _timed(
     return rows
 
 
-def _points(
-    avatar: Avatar, frame: Frame, size: int, truth: Picture, repeats: int
-) -> list[dict[str, Any]]:
-    return _timed(avatar, frame, size, truth, _variants(size), repeats)
-
-
 def _skips(
     avatar: Avatar, frame: Frame, size: int, truth: Picture, repeats: int
 ) -> list[dict[str, Any]]:
@@ -197,14 +189,12 @@ render(avatar, frame.vertices, frame.camera, avatar.appearances[0], settings)
 
 def _cold_start(avatar: Path, cached: bool) -> float:
     """Seconds from the start of a process to its first picture of 256 pixels, reading included."""
-    from .measure import STUDIO
-
     package = str(Path(__file__).parents[2])
     with tempfile.TemporaryDirectory() as empty:
         environment = os.environ | {"PYTHONPATH": package}
         if not cached:
             environment["NUMBA_CACHE_DIR"] = empty
-        command = [sys.executable, "-c", _FIRST_PICTURE, str(avatar), str(STUDIO)]
+        command = [sys.executable, "-c", _FIRST_PICTURE, str(avatar), str(DEFAULT_COLLECTION)]
         started = time.perf_counter()
         done = subprocess.run(command, env=environment, capture_output=True, text=True)
         if done.returncode:

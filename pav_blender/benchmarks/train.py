@@ -142,7 +142,7 @@ def _samples(avatar: Avatar, count: int) -> Samples:
 def _fields(avatar: Avatar, samples: Samples) -> None:
     """Forward and backward of networks and tables."""
     field = avatar.field
-    field.tables.requires_grad_(True)
+    field.requires_grad_(True)
     density, colour = field(samples)
     (density.mean() + colour.mean()).backward()
     field.zero_grad()

@@ -43,7 +43,7 @@ class Config:
     # they are nearest to
     sees_turn: bool = True
     # the paper's sees the expression too; some fifty values tell the filmed frames apart, and what
-    # is learned by that does not hold for others (1 dB on held-out frames, 54 frames a clip)
+    # is learned by that does not hold for others
     sees_expression: bool = False
     # the paper's offset sees the embedding and the expression; seeing the point's geometry
     # features too lets one appearance fill space that another leaves empty
@@ -64,7 +64,7 @@ class Config:
     # optimisation (paper, Optimization and Implementation)
     colour_weight: float = 50.0
     depth_weight: float = 10.0
-    distortion_weight: float = 0.5  # against fog: a quarter fewer samples for the same pictures
+    distortion_weight: float = 0.5  # against fog: fewer samples show the same
     # the paper's rates (2.5e-3, the offset's 2.5e-4) are for 15,000 iterations
     learning_rate: float = 5e-3
     offset_learning_rate: float = 5e-3

@@ -10,7 +10,10 @@ from pathlib import Path
 
 from ..core.errors import InputError
 
-__all__ = ["add_arguments", "render_collection", "run"]
+__all__ = ["DEFAULT_COLLECTION", "add_arguments", "render_collection", "run"]
+
+# what `render_collection` gave by default; only beside the sources, not in an extension
+DEFAULT_COLLECTION = Path(__file__).parents[2] / "data" / "studio3"
 
 
 def render_collection(out, **options) -> Path:

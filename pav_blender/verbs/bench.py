@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 from pathlib import Path
 
 from ..core.errors import InputError
 from ..core.progress import Progress
+from ..studio import DEFAULT_COLLECTION
 
 SUMMARY = "Measure speed against error on a studio avatar; tables, plots and claims."
 EXAMPLE = "pav bench render --out out/bench --check"
@@ -26,16 +28,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    import importlib
-
-    from ..benchmarks.measure import STUDIO, Options
+    from ..benchmarks.measure import Options
     from ..core.evaluation.report import write_proof
     from .doctor import machine, versions
 
     if args.repeats < 1 or not args.minutes > 0:
         raise InputError("--repeats takes 1 or more, --minutes more than 0")
     args.out.mkdir(parents=True, exist_ok=True)
-    options = Options(args.out, args.collection or STUDIO, args.repeats, args.minutes)
+    options = Options(args.out, args.collection or DEFAULT_COLLECTION, args.repeats, args.minutes)
     module = importlib.import_module(f"...benchmarks.{args.name}", __name__)
     fields, claims = module.run(options, Progress("train", as_json=args.json_progress))
     fields |= {"versions": versions(), "machine": machine()}

@@ -18,11 +18,11 @@ import numpy as np
 
 from ..core.errors import InputError, PavError
 from ..core.progress import Progress
+from ..studio import DEFAULT_COLLECTION
 
 SUMMARY = "The main job on the built-in person: clips, avatar, Blender scene, image sequences."
 EXAMPLE = "pav demo --out out/demo"
 
-DEFAULT_COLLECTION = Path(__file__).parents[2] / "data" / "studio3"
 HEAD_PSNR = 28.0
 SWITCH_GAIN = 5.0
 SECONDS = 600.0

@@ -83,16 +83,17 @@ def _compile() -> float:
 
     import numpy as np
 
-    from ..benchmarks.measure import STUDIO, Options, collection_of
+    from ..core.collection import read_collection
     from ..core.config import Config
     from ..core.kernels.cpu.threads import torch_alone
     from ..core.rendering.render import RenderSettings, render
     from ..core.training.frames import load_frames
     from ..core.training.prepare import new_avatar
     from ..core.training.trainer import Trainer
+    from ..studio import DEFAULT_COLLECTION
 
     started = time.monotonic()
-    collection = collection_of(Options(STUDIO, STUDIO))
+    collection = read_collection(DEFAULT_COLLECTION)
     frames = [f for c in collection.clips for f in load_frames(collection, c, np.arange(2))]
     trainer = Trainer(new_avatar(collection, frames, Config()), frames)
     with torch_alone():

@@ -73,7 +73,7 @@ def places(picks) -> set[tuple[int, int]]:
 
 
 TRAINING = Thrift(width=48, share=0.05, longest=3, opaque=8.0)
-PICTURE = Thrift(width=6, share=0.02, longest=4, least=0.5)
+PICTURE = Thrift(width=6, share=0.02, longest=4)
 
 
 @pytest.mark.parametrize("kind", ["empty", "noisy", "solid"])
@@ -85,9 +85,9 @@ def test_the_kernel_picks_what_the_reference_picks(kind, thrift):
     alike = used(got) & same[:, None]
     for name in ("k", "steps"):
         equal = getattr(got, name) == getattr(want, name)
-        assert equal[alike].float().mean() > 0.97 or not alike.any()
+        assert equal[alike].float().mean() > 0.97
     both = alike & (got.k == want.k) & (got.triangle == want.triangle)
-    assert both.sum() > 20 or thrift.least > guide_of(kind).max()
+    assert both.sum() > 20
     torch.testing.assert_close(got.canonical[both], want.canonical[both], rtol=0, atol=2e-5)
     torch.testing.assert_close(got.distance[both], want.distance[both], rtol=0, atol=2e-6)
 
@@ -122,14 +122,6 @@ def test_a_ray_ends_where_a_trusted_guide_is_opaque_and_says_so():
     assert (final <= 1).float().mean() > 0.9  # a surface is not stepped over, but for its fringe
     untrusted = pick(CPU, guide_of("solid"), TRAINING._replace(opaque=math.inf))
     assert torch.equal(untrusted.looks, open_.looks)
-
-
-def test_a_place_that_adds_too_little_is_passed_over():
-    guide = guide_of("noisy")
-    few, every = pick(CPU, guide, ALL._replace(least=1.0)), pick(CPU, guide)
-    assert places(few) < places(every)
-    assert 0.2 < len(places(few)) / len(places(every)) < 0.8
-    assert not places(pick(CPU, guide, ALL._replace(least=float(guide.max()) * 2)))
 
 
 def test_picking_continues_where_it_stopped():

@@ -75,15 +75,13 @@ class Thrift(NamedTuple):
 
     width: samples at most; share: what places that go together may add to a pixel; longest: how
     many they may be; opaque: the guide's optical depth at which a ray ends, or infinite where the
-    guide is not to hide anything; least: density (1/m) below which a
-    place is passed over.
+    guide is not to hide anything.
     """
 
     width: int
     share: float = 0.0
     longest: int = 1
     opaque: float = float("inf")
-    least: float = 0.0
 
 
 class Wave(NamedTuple):

@@ -14,8 +14,9 @@ _TURNS = ((0.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, -0.5, 0.0), (0.3, 0.0, 0.0))
 
 
 def guide(avatar: Avatar, deformer: Deformer, worn: Worn, occupied: np.ndarray) -> torch.Tensor:
-    """The greatest density (1/m) that was found in each cell [G, G, G] of those `occupied`, for the
-    only appearance in `worn`; in those beside them, that of their neighbours; 0 elsewhere."""
+    """The greatest density (1/m) found in each cell [G, G, G] or one beside it, for the only
+    appearance in `worn`; 0 where nothing is `occupied`. Neighbours count since a voxel lies in
+    several cells: without them surfaces were stepped over."""
     count = occupied.shape[0]
     cells = torch.from_numpy(np.argwhere(occupied).astype(np.float32))
     mesh = deformer.pose(avatar.canonical_vertices)
@@ -34,5 +35,4 @@ def guide(avatar: Avatar, deformer: Deformer, worn: Worn, occupied: np.ndarray) 
         found = torch.maximum(found, avatar.field.geometry(samples, worn)[0])
     grid = torch.zeros(1, 1, count, count, count)
     grid[0, 0][torch.from_numpy(occupied)] = found
-    spread = torch.nn.functional.max_pool3d(grid, 3, 1, 1)[0, 0]
-    return spread
+    return torch.nn.functional.max_pool3d(grid, 3, 1, 1)[0, 0]

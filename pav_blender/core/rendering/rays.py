@@ -13,7 +13,7 @@ from ..field.field import Samples
 from ..kernels.structures import Picks, Wave
 from .cameras import Camera
 
-TILE = 4  # rays go together in squares of pixels
+TILE = 4  # rays go together in squares of pixels: neighbours share triangles and cache lines
 
 
 @dataclass(eq=False)

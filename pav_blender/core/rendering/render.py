@@ -29,17 +29,15 @@ Appearance = str | Mapping[str, float]
 class RenderSettings:
     """step: metres between samples; transmittance: a ray ends when less of it is left.
 
-    skip: pass over voxels known to be empty, and by what is known of the density in the others
-    (`guide`) over places of less than `least` (1/m), and take up to `longest` places together that
-    add no more than `share` to a pixel; negligible: weight a metre below which a sample's colour is
-    not asked for; wave: samples a ray between two looks at its transmittance; chunk: rays that
-    a thread takes at a time.
+    skip: pass over voxels known to be empty, and take up to `longest` places together that add no
+    more than `share` to a pixel by what is known of the density there (`guide`); negligible: weight
+    a metre below which a sample's colour is not asked for; wave: samples a ray between two looks at
+    its transmittance; chunk: rays that a thread takes at a time.
     """
 
     step: float = 1.5e-3
     transmittance: float = 1e-3
     skip: bool = True
-    least: float = 0.1
     share: float = 0.02
     longest: int = 4
     negligible: float = 0.05
@@ -50,7 +48,7 @@ class RenderSettings:
     def preset(cls, name: str) -> RenderSettings:
         """ "preview" (fast), "final", "reference" (every sample, to the end of the ray)."""
         presets = {
-            "preview": cls(step=3.5e-3, transmittance=1e-2, least=1.0, share=0.05),
+            "preview": cls(step=3.5e-3, transmittance=1e-2, share=0.05),
             "final": cls(),
             "reference": cls(step=3.9e-4, transmittance=0.0, skip=False, negligible=0.0, wave=64),
         }
@@ -232,8 +230,8 @@ def _trace(scene: Scene, rays: RayBatch, settings: RenderSettings) -> tuple[np.n
     colour, depth, left = torch.zeros(count, 4), torch.zeros(count), torch.ones(count)
     ops = kernels.select("cpu")
     jitter = torch.full((count,), 0.5)
-    field = scene.avatar.field
-    around = (scene.voxels.box, 0.0) if settings.skip else (scene.mesh.vertices, _reach(scene))
+    field, reach = scene.avatar.field, scene.avatar.config.reach
+    around = (scene.voxels.box, 0.0) if settings.skip else (scene.mesh.vertices, reach)
     near, far = ops.marching.bounds(*around, rays.origins, rays.directions)
     first, last = ops.marching.lattice(near, far, jitter, settings.step)
     alive = (last >= first).nonzero()[:, 0]
@@ -268,10 +266,6 @@ def _trace(scene: Scene, rays: RayBatch, settings: RenderSettings) -> tuple[np.n
     return rgba.numpy(), along.numpy()
 
 
-def _reach(scene: Scene) -> float:
-    return scene.avatar.config.reach
-
-
 def _wave(
     scene: Scene,
     rays: RayBatch,
@@ -284,7 +278,7 @@ def _wave(
     ops = kernels.select("cpu")
     middle = torch.full((len(rays),), 0.5)
     lattice = rays.origins, rays.directions, first, last, middle
-    space, reach = scene.clearance, _reach(scene)
+    space, reach = scene.clearance, scene.avatar.config.reach
     if not settings.skip:
         options = {"clearance": space, "band": reach, "leap_limit": 0.0}
         return ops.marching.march(
@@ -300,5 +294,5 @@ def _wave(
         settings.step,
         clearance=space,
         band=reach,
-        thrift=Thrift(settings.wave, settings.share, settings.longest, least=settings.least),
+        thrift=Thrift(settings.wave, settings.share, settings.longest),
     )

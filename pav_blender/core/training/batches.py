@@ -13,8 +13,8 @@ from ..config import Config
 from ..deformation import Clearance, Deformer, PosedMesh, Thrift, Voxels, voxels
 from ..deformation.rigid import Stance, stance
 from ..field.field import Samples, condition
-from ..rendering.rays import Packed, RayBatch, camera_rays, pack, still_of
-from .frames import TILE, Frame
+from ..rendering.rays import TILE, Packed, RayBatch, camera_rays, pack, still_of
+from .frames import Frame
 from .occupancy import Visibility
 
 _UNIFORM = 0.05  # part of the tiles drawn from anywhere in the picture

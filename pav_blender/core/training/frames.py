@@ -13,8 +13,7 @@ from ..images import read_rgba
 from ..progress import Report
 from ..rendering.cameras import Camera
 from ..rendering.rasterise import rasterise
-
-TILE = 4  # rays are drawn in squares of pixels: neighbours share triangles and cache lines
+from ..rendering.rays import TILE
 
 
 @dataclass(eq=False)

@@ -26,7 +26,6 @@ _CARVED = 0.5  # part of the schedule in which space is emptied often
 _PRUNE_EVERY = 50  # iterations, while there is much to empty
 _PRUNE_LATER = 200
 _WARM_UP = 20
-_TABLES = ("tables", "still_tables")
 # parts of the schedule until which pictures are a half and a quarter as large: there are more
 # pixels than an avatar's minutes have rays, and small ones tell the most each
 _COARSE = (0.4, 0.15)
@@ -73,9 +72,9 @@ class Trainer:
             for name, p in avatar.field.named_parameters()
         }
         # the tables' gradient never lies anywhere as a whole: see `encode_adam_step`
-        for name in _TABLES:
-            if name in self.moments:
-                getattr(avatar.field, name).requires_grad_(False)
+        for name, parameter in avatar.field.named_parameters():
+            if name in ("tables", "still_tables"):
+                parameter.requires_grad_(False)
         self._mse = math.nan
 
     @property
@@ -159,6 +158,11 @@ class Trainer:
             "latent": config.latent_learning_rate,
             "code": config.latent_learning_rate,
         }
+        own = field.layout.width
+        encodings = {
+            "tables": (samples.canonical, field.layout, slice(0, own)),
+            "still_tables": (samples.still, field.still_layout, slice(own, None)),
+        }
         for name, parameter in field.named_parameters():
             m, v = self.moments[name]
             settings = {
@@ -168,15 +172,12 @@ class Trainer:
                 "beta2": config.beta2,
                 "eps": config.epsilon,
             }
-            if name in _TABLES:
+            if name in encodings:
                 if encoded.grad is not None:
-                    still = name == "still_tables"
-                    points = samples.still if still else samples.canonical
-                    layout = field.still_layout if still else field.layout
-                    width = field.layout.width
-                    part = encoded.grad[:, width:] if still else encoded.grad[:, :width]
+                    points, layout, columns = encodings[name]
+                    part = encoded.grad[:, columns].contiguous()
                     state = parameter.data, m, v, layout
-                    ops.encoding.encode_adam_step(points, part.contiguous(), *state, **settings)
+                    ops.encoding.encode_adam_step(points, part, *state, **settings)
                 continue
             grad = parameter.grad
             if grad is None or parameter.numel() == 0:

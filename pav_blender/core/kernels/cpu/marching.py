@@ -108,7 +108,12 @@ def locate(arrays, triangle_maps, vertex_maps, vertices, corners, px, py, pz, go
            stack, scratch, feet, triangle, barycentric, canonical, distances):  # fmt: skip
     """Where the points of a packet lie: triangle [16], barycentric and canonical [3 * 16],
     distances [16]; feet [3 * 16], the nearest points found before, bound the search and are set to
-    those found now. Canonical places count where `going` and within the band."""
+    those found now. Only lanes that are `going` (one at least) count, canonical places only within
+    the band."""
+    some = lowest_bit(bits(going))  # stands in for those that are not
+    px = select(going, px, splat(lane(px, some)))
+    py = select(going, py, splat(lane(py, some)))
+    pz = select(going, pz, splat(lane(pz, some)))
     gx, gy, gz = px - load(feet, 0), py - load(feet, LANES), pz - load(feet, 2 * LANES)
     # The last nearest point is a bound; rounding must leave it above the answer.
     best = fma(gx, gx, fma(gy, gy, fma(gz, gz, splat(1e-12)))) * splat(1.00001)
@@ -200,10 +205,6 @@ def _march(
             px = fma(t, load(rays, 3 * LANES), load(rays, 0))
             py = fma(t, load(rays, 4 * LANES), load(rays, LANES))
             pz = fma(t, load(rays, 5 * LANES), load(rays, 2 * LANES))
-            some = lowest_bit(bits(going))
-            px = select(going, px, splat(lane(px, some)))
-            py = select(going, py, splat(lane(py, some)))
-            pz = select(going, pz, splat(lane(pz, some)))
             locate(arrays, triangle_maps, vertex_maps, vertices, flat_corners, px, py, pz, going,
                    band, stack, scratch, feet, triangle, barycentric, canonical,
                    distances)  # fmt: skip

@@ -12,7 +12,7 @@ from numba import njit
 
 from ..reference.picking import BRICK, FALL, GOLDEN, LEAST, RISE
 from ..structures import Clearance, Picks, PosedMesh, Thrift, Voxels
-from .lanes import LANES, bits, lane, load, lowest_bit, select, splat, splat_int
+from .lanes import LANES, load, splat_int
 from .marching import clear_cells, flat, grid_of, locate, rows_of, walk
 from .search import INLINE, OPTIONS, STACK
 from .threads import run_chunks
@@ -68,7 +68,6 @@ def pick(
         np.float32(thrift.share),
         thrift.longest,
         np.float32(thrift.opaque),
-        np.float32(thrift.least),
         *(values.numpy() for values in result),
     )
     return result
@@ -76,7 +75,7 @@ def pick(
 
 @njit(**INLINE)
 def _choose(ray, first, last, origins, directions, jitter, step, bricks, brick_count, cells, corner,
-            scale, guide, chance, left, share, longest, opaque, least, width, k_out,
+            scale, guide, chance, left, share, longest, opaque, width, k_out,
             steps_out):  # fmt: skip
     """The places of one ray that are samples: how many, how many looks, where to go on."""
     ox = (origins[ray, 0] - corner[0]) * scale
@@ -106,10 +105,7 @@ def _choose(ray, first, last, origins, directions, jitter, step, bricks, brick_c
         cell = cells[((row * BRICK + u) * BRICK + v) * BRICK + w]
         if cell < 0:
             continue
-        density = guide[cell]
-        if not density >= least:
-            continue
-        optical = density * step
+        optical = guide[cell] * step
         more = left * (np.float32(1.0) - np.exp(-optical))
         if length > 0 and length < longest and begin + length == k - 1 and added + more <= share:
             length += 1
@@ -157,14 +153,14 @@ def _close(k_out, steps_out, count, begin, length, chance):
 def _pick(start, stop, arrays, triangle_maps, vertex_maps, vertices, corners,
           origins, directions, first, last, jitter, step, grid, size, corner, scale, band,
           bricks, brick_count, cells, brick_corner, brick_scale, guide, chance, left,
-          share, longest, opaque, least, out_count, out_looks, out_next, out_k, out_steps,
+          share, longest, opaque, out_count, out_looks, out_next, out_k, out_steps,
           out_triangle, out_barycentric, out_canonical, out_distance):  # fmt: skip
     width = out_k.shape[1]
     for ray in range(start, stop):
         count, looks, following = _choose(
             ray, first[ray], last[ray], origins, directions, jitter[ray], step, bricks,
             brick_count, cells, brick_corner, brick_scale, guide, chance[ray], left[ray], share,
-            longest, opaque, least, width, out_k[ray], out_steps[ray])  # fmt: skip
+            longest, opaque, width, out_k[ray], out_steps[ray])  # fmt: skip
         out_count[ray] = count
         out_looks[ray] = looks
         out_next[ray] = following
@@ -200,10 +196,6 @@ def _pick(start, stop, arrays, triangle_maps, vertex_maps, vertices, corners,
                     points[axis * LANES + i] = origins[base + i, axis] + along
             going = splat_int(0) < load(active, 0)
             px, py, pz = load(points, 0), load(points, LANES), load(points, 2 * LANES)
-            some = lowest_bit(bits(going))
-            px = select(going, px, splat(lane(px, some)))
-            py = select(going, py, splat(lane(py, some)))
-            pz = select(going, pz, splat(lane(pz, some)))
             locate(arrays, triangle_maps, vertex_maps, vertices, corners, px, py, pz, going, band,
                    stack, scratch, feet, triangle, barycentric, canonical,
                    distances)  # fmt: skip

@@ -69,7 +69,7 @@ def pick(
         here = going & (first <= k) & (k <= last)
         t = (k + jitter) * step
         density = density_of[_cells(voxels, origins + t[:, None] * directions)]
-        seen = here & (density >= thrift.least) & (density >= 0)
+        seen = here & (density >= 0)
         alpha = -torch.expm1(-density * step)
         more = left * alpha
         together = seen & (length > 0) & (begin + length == k) & (length < thrift.longest)
