@@ -32,7 +32,8 @@ _PREVIEW = RenderSettings.preset("preview")
 # switch, what is changed to turn it off
 SKIPS = {
     "voxels and their guide": {"skip": False},
-    "places taken together": {"longest": 1},
+    "runs looked at in their middle": {"probe": 1},
+    "runs and thin places taken together": {"probe": 1, "longest": 1},
     "opaque rays": {"transmittance": 0.0},
     "colours that hardly show": {"negligible": 0.0},
 }
@@ -94,48 +95,31 @@ def _picture(avatar: Avatar, frame: Frame, size: int, settings: RenderSettings) 
 def _variants(size: int) -> dict[str, RenderSettings]:
     change = dataclasses.replace
     found = {"preview": _PREVIEW, "final": _FINAL}
-    for step in (0.75, 1.0, 2.0, 3.0, 4.0):
+    for step in (0.75, 1.0, 1.5, 2.0, 3.0):
         found[f"step {step:g} mm"] = change(_FINAL, step=step * 1e-3)
     if size != _DETAILED:
         return found
-    for left in (1e-4, 1e-2, 3e-2):
+    for left in (1e-4, 1e-3, 2e-2):
         found[f"transmittance {left:g}"] = change(_FINAL, transmittance=left)
     for share in (0.0, 0.05, 0.1):
         found[f"share {share:g}"] = change(_FINAL, share=share)
+    for tolerance in (0.05, 0.1, 0.4):
+        found[f"tolerance {tolerance:g}"] = change(_FINAL, tolerance=tolerance)
+    for probe in (1, 2, 4):
+        found[f"runs of {probe}"] = change(_FINAL, probe=probe)
     return found
-
-
-class _Counted:
-    """Counts density evaluations of an avatar while it holds."""
-
-    def __init__(self, avatar: Avatar) -> None:
-        self._field, self.count = avatar.field, 0
-
-    def __enter__(self) -> _Counted:
-        geometry = self._field.geometry
-
-        def counted(samples: Any, *rest: Any) -> Any:
-            self.count += len(samples.canonical)
-            return geometry(samples, *rest)
-
-        self._field.geometry = counted  # type: ignore[assignment]
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        del self._field.geometry
 
 
 def _point(
     avatar: Avatar, frame: Frame, size: int, settings: RenderSettings, truth: Picture, name: str
 ) -> dict[str, Any]:
-    with _Counted(avatar) as counted:
-        picture = _picture(avatar, frame, size, settings)
+    picture = _picture(avatar, frame, size, settings)
     return {
         "name": name,
         "size": size,
         "seconds": 0.0,
         "psnr": round(psnr(over(picture.rgba, 1.0), over(truth.rgba, 1.0)), 2),
-        "evaluations": round(counted.count / size**2, 2),
+        "evaluations": round(picture.evaluations / size**2, 2),
     }
 
 

@@ -14,7 +14,7 @@ from pav_blender.benchmarks import kernels as kernels_bench
 from pav_blender.benchmarks import scale
 from pav_blender.benchmarks.measure import Options, a_frame, best, collection_of, plot
 from pav_blender.benchmarks.plain import dense
-from pav_blender.benchmarks.render import SKIPS, _Counted, _front, _picture, _skips
+from pav_blender.benchmarks.render import SKIPS, _front, _picture, _skips
 from pav_blender.core.errors import InputError
 from pav_blender.core.evaluation.metrics import over, psnr
 from pav_blender.core.rendering.render import RenderSettings
@@ -39,15 +39,6 @@ def test_every_skip_costs_less_than_it_hides(toy, toy_avatar):
     assert final["psnr"] > 45
     assert all(row["evaluations"] >= 0.999 * final["evaluations"] for row in without)
     assert max(row["evaluations"] for row in without) > 1.2 * final["evaluations"]
-
-
-def test_evaluations_are_counted_only_within(toy, toy_avatar):
-    frame = a_frame(toy)
-    with _Counted(toy_avatar) as counted:
-        _picture(toy_avatar, frame, 32, RenderSettings())
-    seen = counted.count
-    _picture(toy_avatar, frame, 32, RenderSettings())
-    assert counted.count == seen > 100
 
 
 def test_the_clock_takes_the_least_in_turns():

@@ -5,6 +5,7 @@ import pytest
 
 from pav_blender.core.errors import Cancelled, InputError
 from pav_blender.core.evaluation.metrics import over, psnr
+from pav_blender.core.rendering import render as rendering
 from pav_blender.core.rendering.render import RenderSettings, render
 from pav_blender.core.training.frames import camera_of
 
@@ -49,17 +50,47 @@ def test_a_region_is_that_part_of_the_whole(toy_avatar, pose):
     np.testing.assert_allclose(part.depth, whole.depth[5:45, 10:50], rtol=1e-5)
 
 
+EVERY = RenderSettings(probe=1, longest=1)  # looks at every place that is in some voxel
+
+
 def test_skipping_empty_space_changes_next_to_nothing(toy_avatar, pose):
-    skipped = picture(toy_avatar, pose, settings=RenderSettings())
-    walked = picture(toy_avatar, pose, settings=RenderSettings(skip=False))
+    skipped = picture(toy_avatar, pose, settings=EVERY)
+    walked = picture(toy_avatar, pose, settings=dataclasses.replace(EVERY, skip=False))
     assert psnr(over(skipped.rgba, 1.0), over(walked.rgba, 1.0)) > 50
     assert np.abs(skipped.rgba[..., 3] - walked.rgba[..., 3]).max() < 0.02
+
+
+def test_looking_at_the_middles_of_runs_changes_little(toy_avatar, pose):
+    usual, every = picture(toy_avatar, pose), picture(toy_avatar, pose, settings=EVERY)
+    assert psnr(over(usual.rgba, 1.0), over(every.rgba, 1.0)) > 46
+    # no more than a run may add where it is not taken apart
+    assert np.abs(usual.rgba[..., 3] - every.rgba[..., 3]).max() <= RenderSettings().tolerance
+    blind = picture(toy_avatar, pose, settings=RenderSettings(tolerance=1.0))
+    assert psnr(over(blind.rgba, 1.0), over(every.rgba, 1.0)) < psnr(
+        over(usual.rgba, 1.0), over(every.rgba, 1.0)
+    )
+
+
+def test_what_thin_places_add_changes_little(toy_avatar, pose):
+    thin = picture(toy_avatar, pose, settings=RenderSettings(probe=1))
+    every = picture(toy_avatar, pose, settings=EVERY)
+    assert not np.array_equal(thin.rgba, every.rgba)
+    assert psnr(over(thin.rgba, 1.0), over(every.rgba, 1.0)) > 48
+
+
+def test_compiled_rays_are_those_that_go_step_by_step(toy_avatar, pose, monkeypatch):
+    whole = picture(toy_avatar, pose, settings=EVERY)
+    monkeypatch.setattr(rendering, "_whole", rendering._by_waves)
+    steps = picture(toy_avatar, pose, settings=EVERY)
+    assert np.abs(over(whole.rgba, 1.0) - over(steps.rgba, 1.0)).max() < 2e-3
+    seen = np.isfinite(steps.depth) & (steps.rgba[..., 3] > 0.5)
+    np.testing.assert_allclose(whole.depth[seen], steps.depth[seen], atol=1e-4)
 
 
 def test_ending_opaque_rays_changes_next_to_nothing(toy_avatar, pose):
     ended = picture(toy_avatar, pose, settings=RenderSettings())
     whole = picture(toy_avatar, pose, settings=RenderSettings(transmittance=0.0))
-    assert psnr(ended.rgba, whole.rgba) > 50
+    assert psnr(over(ended.rgba, 1.0), over(whole.rgba, 1.0)) > 50
 
 
 def test_leaving_out_what_hardly_shows_changes_next_to_nothing(toy_avatar, pose):
@@ -74,12 +105,9 @@ def test_waves_and_chunks_do_not_show(toy_avatar, pose):
     chunks = picture(toy_avatar, pose, settings=RenderSettings(chunk=1000))
     assert np.abs(over(usual.rgba, 1.0) - over(chunks.rgba, 1.0)).max() < 2e-3
     # where a wave ends, places that would go together are parted
-    waves = picture(toy_avatar, pose, settings=RenderSettings(wave=3))
-    assert psnr(over(usual.rgba, 1.0), over(waves.rgba, 1.0)) > 48
-    single = RenderSettings(longest=1)
-    alone = [
-        picture(toy_avatar, pose, settings=dataclasses.replace(single, wave=w)) for w in (3, 9)
-    ]
+    waves = picture(toy_avatar, pose, settings=RenderSettings(wave=8))
+    assert psnr(over(usual.rgba, 1.0), over(waves.rgba, 1.0)) > 46
+    alone = [picture(toy_avatar, pose, settings=dataclasses.replace(EVERY, wave=w)) for w in (3, 9)]
     assert np.abs(over(alone[0].rgba, 1.0) - over(alone[1].rgba, 1.0)).max() < 2e-3
 
 

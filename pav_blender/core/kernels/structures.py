@@ -84,6 +84,24 @@ class Thrift(NamedTuple):
     opaque: float = float("inf")
 
 
+class Probing(NamedTuple):
+    """How a picture's rays look at places: in runs, of which the middle is looked at first.
+
+    width: runs between two looks at a ray's transmittance; probe: places in a run; longest: places
+    in a run that adds no more than `share` to a pixel by what a guide knows; tolerance: a run that
+    adds more is taken apart (1: none is); transmittance: a ray ends when less of it is left;
+    negligible: weight a metre below which a sample's colour is not asked for.
+    """
+
+    width: int
+    share: float
+    longest: int
+    probe: int
+    tolerance: float
+    transmittance: float
+    negligible: float
+
+
 class Wave(NamedTuple):
     """Up to W occupied samples a ray; entries beyond `count` hold -1 (k, triangle) and zeros."""
 
@@ -113,3 +131,41 @@ class Picks(NamedTuple):
     barycentric: torch.Tensor
     canonical: torch.Tensor
     distance: torch.Tensor
+
+
+class Layers(NamedTuple):
+    """A ReLU network: weights [out, in] and biases [out] of each layer."""
+
+    weights: list[torch.Tensor]
+    biases: list[torch.Tensor]
+
+
+@dataclass(frozen=True, eq=False)
+class Frozen:
+    """A field held still for one picture: what depends on the frame or the appearance alone is in
+    the networks' first biases.
+
+    A sample's `inputs` are its embedding, log-density and geometry features, in this order; offset
+    and colour see all of them (what one does not use has a weight of 0).
+    """
+
+    encodings: tuple[tuple[torch.Tensor, Any], ...]  # tables and layout, of the canonical place
+    # and, where the field has it, of the place that rests with the shoulders
+    density: Layers
+    offset: Layers | None
+    colour: Layers
+    view: torch.Tensor  # [16, hidden]: harmonics of the direction to the colour's first layer
+    latent: torch.Tensor  # [V, C] at vertices or [S, S, C] texels; C may be 0
+    corner_uvs: torch.Tensor  # [T, 3, 2] where there are texels, else [0, 3, 2]
+    untrained: tuple[float, float, float, float]  # far log-density, rise at the mesh, falloff, skin
+    limit: float  # of log-densities
+
+
+class Traced(NamedTuple):
+    """Rays that ended: colour [R, 4] of what was worth a look and how much of the ray that was,
+    depth [R] (weighted), left [R] transmittance; how many densities were evaluated."""
+
+    colour: torch.Tensor
+    depth: torch.Tensor
+    left: torch.Tensor
+    evaluations: int

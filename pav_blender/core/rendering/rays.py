@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -42,6 +43,7 @@ def camera_rays(camera: Camera, columns: np.ndarray, rows: np.ndarray) -> RayBat
     )
 
 
+@lru_cache(maxsize=8)
 def tiled(width: int, height: int) -> np.ndarray:
     """Pixels [width * height] (row * width + column), tile after tile: neighbours search alike."""
     pixels = np.arange(width * height)

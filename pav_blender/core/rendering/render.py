@@ -16,8 +16,9 @@ from ..deformation.rigid import Stance, stance
 from ..errors import Cancelled, InputError
 from ..field.avatar import Avatar
 from ..field.field import Worn, condition
+from ..field.frozen import freeze
 from ..kernels.cpu.threads import run_chunks, torch_alone
-from ..kernels.structures import Picks, Wave
+from ..kernels.structures import Frozen, Picks, Probing, Traced, Wave
 from .cameras import Camera
 from .guide import guide
 from .rays import RayBatch, camera_rays, pack, samples_of, tiled
@@ -27,28 +28,33 @@ Appearance = str | Mapping[str, float]
 
 @dataclass(frozen=True)
 class RenderSettings:
-    """step: metres between samples; transmittance: a ray ends when less of it is left.
+    """step: metres between places; transmittance: a ray ends when less of it is left.
 
-    skip: pass over voxels known to be empty, and take up to `longest` places together that add no
-    more than `share` to a pixel by what is known of the density there (`guide`); negligible: weight
-    a metre below which a sample's colour is not asked for; wave: samples a ray between two looks at
-    its transmittance; chunk: rays that a thread takes at a time.
+    skip: pass over voxels known to be empty, look only at the middle of `probe` places that follow
+    one another, or of `longest` that add no more than `share` to a pixel by what is known of the
+    density there (`guide`), and at those beside it only where that adds more than `tolerance`;
+    negligible: weight a metre below which a sample's colour is not asked for; wave: samples a ray
+    between two looks at its transmittance; chunk: rays that a thread takes at a time.
     """
 
-    step: float = 1.5e-3
-    transmittance: float = 1e-3
+    step: float = 1.25e-3
+    transmittance: float = 5e-3
     skip: bool = True
     share: float = 0.02
     longest: int = 4
-    negligible: float = 0.05
-    wave: int = 6
-    chunk: int = 1 << 15
+    probe: int = 3
+    tolerance: float = 0.2
+    negligible: float = 0.5
+    wave: int = 3
+    chunk: int = 1 << 13
 
     @classmethod
     def preset(cls, name: str) -> RenderSettings:
         """ "preview" (fast), "final", "reference" (every sample, to the end of the ray)."""
         presets = {
-            "preview": cls(step=3.5e-3, transmittance=1e-2, share=0.05),
+            "preview": cls(
+                step=2.5e-3, transmittance=2e-2, share=0.05, tolerance=0.4, negligible=1.0
+            ),
             "final": cls(),
             "reference": cls(step=3.9e-4, transmittance=0.0, skip=False, negligible=0.0, wave=64),
         }
@@ -59,10 +65,12 @@ class RenderSettings:
 
 @dataclass(eq=False)
 class Picture:
-    """rgba [H, W, 4] float32, straight sRGB; depth [H, W] float32, metres along z, inf if empty."""
+    """rgba [H, W, 4] float32, straight sRGB; depth [H, W] float32, metres along z, inf if empty;
+    evaluations: densities that were evaluated for it."""
 
     rgba: np.ndarray
     depth: np.ndarray
+    evaluations: int
 
 
 @dataclass(eq=False)
@@ -74,9 +82,11 @@ class Scene:
     clearance: Clearance
     voxels: Voxels
     guide: torch.Tensor
+    thickness: torch.Tensor
     stance: Stance
     condition: torch.Tensor
     worn: Worn
+    frozen: Frozen
 
 
 _deformers: weakref.WeakKeyDictionary[Avatar, Deformer] = weakref.WeakKeyDictionary()
@@ -162,15 +172,21 @@ def pose_scene(
     canonical = avatar.canonical_vertices
     stands = stance(canonical, vertices, avatar.rigid_weights)
     mesh, space = deformer_of(avatar).pose(vertices), space_of(avatar, rows)
+    seen = condition(avatar.config, values.astype(np.float32), stands.turn)
+    worn = avatar.field.blend(torch.from_numpy(weights))
+    filled, guide = voxels(mesh, space, avatar.config.reach), guide_of(avatar, weights)
+    thickness = kernels.select("cpu").tracing.thickness(filled, guide)
     return Scene(
         avatar,
         mesh,
         space,
-        voxels(mesh, space, avatar.config.reach),
-        guide_of(avatar, weights),
+        filled,
+        guide,
+        thickness,
         stands,
-        condition(avatar.config, values.astype(np.float32), stands.turn),
-        avatar.field.blend(torch.from_numpy(weights)),
+        seen,
+        worn,
+        freeze(avatar.field, seen, worn),
     )
 
 
@@ -194,7 +210,8 @@ def render(
     settings = settings or RenderSettings()
     if region is not None:
         camera = camera.window(*region)
-    caller, done = threading.get_ident(), 0
+    caller, done, evaluations = threading.get_ident(), 0, 0
+    adding = threading.Lock()
     with torch.inference_mode(), torch_alone():
         scene = pose_scene(avatar, vertices, appearance, expression)
         order = tiled(camera.width, camera.height)
@@ -203,7 +220,7 @@ def render(
         depth = np.full(count, np.inf, np.float32)
 
         def trace(start: int, stop: int) -> None:
-            nonlocal done
+            nonlocal done, evaluations
             # who asked for the picture may not be asked from another thread: Blender's is one
             ours = threading.get_ident() == caller
             if ours and should_stop is not None and should_stop():
@@ -211,8 +228,9 @@ def render(
             pixels = order[start:stop]
             rays = camera_rays(camera, pixels % camera.width, pixels // camera.width)
             with torch.inference_mode():
-                rgba[pixels], depth[pixels] = _trace(scene, rays, settings)
-            done += stop - start
+                rgba[pixels], depth[pixels], evaluated = _trace(scene, rays, settings)
+            with adding:
+                done, evaluations = done + stop - start, evaluations + evaluated
             if ours and progress is not None:
                 progress(min(1.0, done / count))
 
@@ -220,12 +238,62 @@ def render(
         if progress is not None:
             progress(1.0)
     shape = (camera.height, camera.width)
-    return Picture(rgba.reshape(*shape, 4), depth.reshape(shape))
+    return Picture(rgba.reshape(*shape, 4), depth.reshape(shape), evaluations)
 
 
-def _trace(scene: Scene, rays: RayBatch, settings: RenderSettings) -> tuple[np.ndarray, np.ndarray]:
-    """Straight RGBA [R, 4] and depth along the camera's axis [R]."""
-    count = len(rays)
+def _trace(
+    scene: Scene, rays: RayBatch, settings: RenderSettings
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """Straight RGBA [R, 4], depth along the camera's axis [R], and how many densities it took."""
+    run = _whole if settings.skip else _by_waves
+    colour, depth, left, evaluations = run(scene, rays, settings)
+    opacity = 1 - left
+    seen = (opacity > 1e-4) & (colour[:, 3] > 0)
+    safe = torch.where(seen, opacity, 1.0)[:, None]
+    straight = (colour[:, :3] / torch.where(seen, colour[:, 3], 1.0)[:, None]).clamp(0, 1)
+    # a ray that was ended early is opaque: what is left of it would be seen through nothing
+    alpha = torch.where(left <= settings.transmittance, 1.0, opacity).clamp(0, 1)
+    rgba = torch.where(seen[:, None], torch.cat([straight, alpha[:, None]], 1), 0.0)
+    along = torch.where(seen, depth / safe[:, 0] * rays.cosine, torch.inf)
+    return rgba.numpy(), along.numpy(), evaluations
+
+
+def _whole(scene: Scene, rays: RayBatch, settings: RenderSettings) -> Traced:
+    """The rays in one compiled pass."""
+    ops, stance = kernels.select("cpu"), scene.stance
+    near, far = ops.marching.bounds(scene.voxels.box, 0.0, rays.origins, rays.directions)
+    half = torch.full((len(rays),), 0.5)
+    first, last = ops.marching.lattice(near, far, half, settings.step)
+    still = np.concatenate([stance.shoulders.T, stance.offset[:, None]], 1)
+    return ops.tracing.trace(
+        scene.mesh,
+        scene.voxels,
+        scene.thickness,
+        scene.frozen,
+        rays.origins,
+        rays.directions,
+        first,
+        last,
+        settings.step,
+        clearance=scene.clearance,
+        band=scene.avatar.config.reach,
+        still=torch.from_numpy(still),
+        rotation=torch.from_numpy(stance.rotation),
+        probing=Probing(
+            settings.wave,
+            settings.share,
+            settings.longest,
+            settings.probe,
+            settings.tolerance,
+            settings.transmittance,
+            settings.negligible,
+        ),
+    )
+
+
+def _by_waves(scene: Scene, rays: RayBatch, settings: RenderSettings) -> Traced:
+    """The same step by step, with the field as it is."""
+    count, evaluations = len(rays), 0
     # the colours of what was worth a look, and how much of the ray that was
     colour, depth, left = torch.zeros(count, 4), torch.zeros(count), torch.ones(count)
     ops = kernels.select("cpu")
@@ -242,6 +310,7 @@ def _trace(scene: Scene, rays: RayBatch, settings: RenderSettings) -> tuple[np.n
         if len(packed):
             samples = samples_of(packed, scene.clearance, 0, scene.condition, part, scene.stance)
             sigma, inputs = field.geometry(samples, scene.worn)
+            evaluations += len(sigma)
             ray = alive[packed.ray.long()]
             width = torch.full_like(sigma, settings.step)
             if isinstance(wave, Picks):
@@ -255,15 +324,7 @@ def _trace(scene: Scene, rays: RayBatch, settings: RenderSettings) -> tuple[np.n
         first[alive] = wave.next
         going = (wave.next <= last[alive]) & (left[alive] > settings.transmittance)
         alive = alive[going]
-    opacity = 1 - left
-    seen = (opacity > 1e-4) & (colour[:, 3] > 0)
-    safe = torch.where(seen, opacity, 1.0)[:, None]
-    straight = (colour[:, :3] / torch.where(seen, colour[:, 3], 1.0)[:, None]).clamp(0, 1)
-    # a ray that was ended early is opaque: what is left of it would be seen through nothing
-    alpha = torch.where(left <= settings.transmittance, 1.0, opacity).clamp(0, 1)
-    rgba = torch.where(seen[:, None], torch.cat([straight, alpha[:, None]], 1), 0.0)
-    along = torch.where(seen, depth / safe[:, 0] * rays.cosine, torch.inf)
-    return rgba.numpy(), along.numpy()
+    return Traced(colour, depth, left, evaluations)
 
 
 def _wave(

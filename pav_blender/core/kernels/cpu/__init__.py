@@ -96,8 +96,8 @@ def _tell_of_compiling() -> None:
 
 
 def __getattr__(name: str) -> Any:
-    if name in (*MODULES, "threads"):
-        if name in MODULES:
+    if name in (*MODULES, "tracing", "threads"):
+        if name != "threads":
             _tell_of_compiling()
         return importlib.import_module(f"{__name__}.{name}")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -60,7 +60,7 @@ def encode_backward_into(
     """Add the gradient of `encode` with respect to the tables to grad_tables, in place."""
     check_encode(points, grad_tables, layout)
     arrays = _array(points), _array(grad_out.t()).reshape(-1), _flat_in_place(grad_tables)
-    _run_levels(_backward_levels, len(points), layout, *arrays, _level_array(layout))
+    _run_levels(_backward_levels, len(points), layout, *arrays, level_array(layout))
 
 
 def encode_adam_step(
@@ -85,7 +85,7 @@ def encode_adam_step(
     settings = adam_settings(step, lr, beta1, beta2, eps, weight_decay)
     sizes = np.array(layout.sizes[::-1], np.int64)
     arrays = _array(points), _array(grad_out.t()).reshape(-1), *state, settings, sizes
-    _run_levels(_adam_levels, len(points), layout, *arrays, _level_array(layout))
+    _run_levels(_adam_levels, len(points), layout, *arrays, level_array(layout))
 
 
 class _Encode(torch.autograd.Function):
@@ -95,7 +95,7 @@ class _Encode(torch.autograd.Function):
         ctx.layout = layout
         out = torch.empty(layout.width, len(points))
         arrays = _array(points), _array(tables).reshape(-1), out.view(-1).numpy()
-        _run_levels(_encode_levels, len(points), layout, *arrays, _level_array(layout))
+        _run_levels(_encode_levels, len(points), layout, *arrays, level_array(layout))
         return out.t()
 
     @staticmethod
@@ -113,7 +113,7 @@ def _run_levels(kernel: Callable[..., Any], count: int, layout: Layout, *arrays:
     run_chunks(kernel, layout.levels, max(1, min(share, 8192 // max(count, 1))), *arrays)
 
 
-def _level_array(layout: Layout) -> np.ndarray:
+def level_array(layout: Layout) -> np.ndarray:
     """Resolution, first entry, hash mask (0 where dense) and number of every level.
 
     The finest come first: they take longest, and the short ones fill the gap at the end.

@@ -20,7 +20,6 @@ from .lanes import (
     LANES,
     bits,
     fma,
-    gather,
     lane,
     load,
     lowest_bit,
@@ -40,47 +39,31 @@ __all__ = ["bounds", "canonicalise", "composite", "lattice", "march", "weigh"]
 _CHUNK = 256  # rays a thread takes at a time: a multiple of LANES
 # Of a clear distance in canonical space, what a step in posed space may use: the maps stretch.
 _TRUST = 0.7
+_MAP = 12  # numbers of a map
 
 
 @njit(**INLINE)
-def _row(maps, r, row, x, y, z, w):
-    """One row of the maps at offsets r: applied to (x, y, z), plus w times its last column."""
-    last = gather(maps, r, row + 3) * w
-    last = fma(gather(maps, r, row + 2), z, last)
-    return fma(gather(maps, r, row), x, fma(gather(maps, r, row + 1), y, last))
+def _canonical(triangle_maps, vertex_maps, vertices, corners, triangle, wa, wb, wc, x, y, z, row):
+    """Canonical place of a posed point; triangle must not be negative. `kernels/structures.py`.
 
-
-@njit(**INLINE)
-def _apply(maps, r, x, y, z, w):
-    """The maps at offsets r applied to (x, y, z), plus w times their last columns."""
-    return (
-        _row(maps, r, 0, x, y, z, w),
-        _row(maps, r, 4, x, y, z, w),
-        _row(maps, r, 8, x, y, z, w),
-    )
-
-
-@njit(**INLINE)
-def _canonical(triangle_maps, vertex_maps, vertices, corners, triangle, wa, wb, wc, px, py, pz):
-    """Canonical places of a packet; triangles must not be negative. `kernels/structures.py`."""
+    row [16] is scratch: a point's map is gathered as a whole, which is a third of the instructions
+    of gathering its twelve numbers for sixteen points.
+    """
     if len(vertex_maps) == 0:
-        return _apply(triangle_maps, triangle * splat_int(12), px, py, pz, splat(1.0))
-    three, twelve = splat_int(3), splat_int(12)
-    a = gather(corners, triangle * three, 0)
-    b = gather(corners, triangle * three, 1)
-    c = gather(corners, triangle * three, 2)
-    i, j, k = a * three, b * three, c * three
-    dx = px - wa * gather(vertices, i, 0) - wb * gather(vertices, j, 0)
-    dy = py - wa * gather(vertices, i, 1) - wb * gather(vertices, j, 1)
-    dz = pz - wa * gather(vertices, i, 2) - wb * gather(vertices, j, 2)
-    dx = dx - wc * gather(vertices, k, 0)
-    dy = dy - wc * gather(vertices, k, 1)
-    dz = dz - wc * gather(vertices, k, 2)
-    x, y, z = _apply(vertex_maps, a * twelve, wa * dx, wa * dy, wa * dz, wa)
-    u, v, w = _apply(vertex_maps, b * twelve, wb * dx, wb * dy, wb * dz, wb)
-    x, y, z = x + u, y + v, z + w
-    u, v, w = _apply(vertex_maps, c * twelve, wc * dx, wc * dy, wc * dz, wc)
-    return x + u, y + v, z + w
+        store(row, 0, load(triangle_maps, triangle * _MAP))
+    else:
+        a, b, c = corners[3 * triangle], corners[3 * triangle + 1], corners[3 * triangle + 2]
+        blend = splat(wa) * load(vertex_maps, a * _MAP)
+        blend = fma(splat(wb), load(vertex_maps, b * _MAP), blend)
+        store(row, 0, fma(splat(wc), load(vertex_maps, c * _MAP), blend))
+        x -= wa * vertices[3 * a] + wb * vertices[3 * b] + wc * vertices[3 * c]
+        y -= wa * vertices[3 * a + 1] + wb * vertices[3 * b + 1] + wc * vertices[3 * c + 1]
+        z -= wa * vertices[3 * a + 2] + wb * vertices[3 * b + 2] + wc * vertices[3 * c + 2]
+    return (
+        row[0] * x + row[1] * y + row[2] * z + row[3],
+        row[4] * x + row[5] * y + row[6] * z + row[7],
+        row[8] * x + row[9] * y + row[10] * z + row[11],
+    )
 
 
 @njit(**INLINE)
@@ -128,17 +111,20 @@ def locate(arrays, triangle_maps, vertex_maps, vertices, corners, px, py, pz, go
     distance = square_root(select(going, best, splat(0.0)))
     store(distances, 0, distance)
     settle(arrays, found, wa, wb, wc, triangle, barycentric)
-    if bits(going & (distance <= splat(band))) == 0:
-        return
-    index = load(triangle, 0)
-    index = select(index < splat_int(0), splat_int(0), index)
-    wa, wb, wc = load(barycentric, 0), load(barycentric, LANES), load(barycentric, 2 * LANES)
-    x, y, z = _canonical(
-        triangle_maps, vertex_maps, vertices, corners, index, wa, wb, wc, px, py, pz
-    )
-    store(canonical, 0, x)
-    store(canonical, LANES, y)
-    store(canonical, 2 * LANES, z)
+    near = bits(going & (distance <= splat(band)))
+    store(canonical, 0, px)
+    store(canonical, LANES, py)
+    store(canonical, 2 * LANES, pz)
+    while near != 0:
+        i = lowest_bit(near)
+        near &= near - 1
+        if triangle[i] < 0:
+            continue
+        x, y, z = _canonical(triangle_maps, vertex_maps, vertices, corners, triangle[i],
+                             barycentric[i], barycentric[LANES + i], barycentric[2 * LANES + i],
+                             canonical[i], canonical[LANES + i], canonical[2 * LANES + i],
+                             scratch)  # fmt: skip
+        canonical[i], canonical[LANES + i], canonical[2 * LANES + i] = x, y, z
 
 
 @njit(**OPTIONS)
@@ -264,6 +250,15 @@ def flat(values: torch.Tensor | None) -> np.ndarray:
     return np.ascontiguousarray(values.detach().numpy(), np.float32).reshape(-1)
 
 
+def _maps(maps: torch.Tensor | None) -> np.ndarray:
+    """Maps [N,3,4] one after the other; the last is read as a whole vector, so there is room."""
+    if maps is None:
+        return _NOTHING
+    room = np.empty(maps.numel() + LANES - _MAP, np.float32)
+    room[: maps.numel()] = maps.detach().numpy().reshape(-1)
+    return room
+
+
 def rows_of(values: torch.Tensor, kind: type) -> np.ndarray:
     return np.ascontiguousarray(values.detach().numpy(), kind)
 
@@ -291,8 +286,8 @@ def walk(
     """What compiled functions are told of a mesh, rays and the clearance; as `march`."""
     return (
         mesh.search.arrays,
-        flat(mesh.triangle_maps),
-        flat(mesh.vertex_maps),
+        _maps(mesh.triangle_maps),
+        _maps(mesh.vertex_maps),
         flat(mesh.vertices),
         mesh.search.topology.corners.reshape(-1),
         rows_of(origins, np.float32),
@@ -353,36 +348,14 @@ def march(
 def _canonicalise(
     start, stop, points, triangles, barycentric, triangle_maps, vertex_maps, vertices, corners, out
 ):
-    place = np.empty(6 * LANES, np.float32)
-    index = np.empty(LANES, np.int32)
-    for base in range(start, stop, LANES):
-        count = min(LANES, stop - base)
-        for i in range(LANES):
-            row = base + min(i, count - 1)
-            index[i] = max(triangles[row], 0)
-            for axis in range(3):
-                place[axis * LANES + i] = points[row, axis]
-                place[(axis + 3) * LANES + i] = barycentric[row, axis]
-        x, y, z = _canonical(
-            triangle_maps,
-            vertex_maps,
-            vertices,
-            corners,
-            load(index, 0),
-            load(place, 3 * LANES),
-            load(place, 4 * LANES),
-            load(place, 5 * LANES),
-            load(place, 0),
-            load(place, LANES),
-            load(place, 2 * LANES),
-        )
-        store(place, 0, x)
-        store(place, LANES, y)
-        store(place, 2 * LANES, z)
-        for i in range(count):
-            for axis in range(3):
-                lost = triangles[base + i] < 0
-                out[base + i, axis] = points[base + i, axis] if lost else place[axis * LANES + i]
+    row = np.empty(LANES, np.float32)
+    for i in range(start, stop):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        if triangles[i] >= 0:
+            wa, wb, wc = barycentric[i, 0], barycentric[i, 1], barycentric[i, 2]
+            x, y, z = _canonical(triangle_maps, vertex_maps, vertices, corners, triangles[i],
+                                 wa, wb, wc, x, y, z, row)  # fmt: skip
+        out[i, 0], out[i, 1], out[i, 2] = x, y, z
 
 
 def canonicalise(
@@ -403,8 +376,8 @@ def canonicalise(
         rows_of(points, np.float32),
         rows_of(triangle, np.int32),
         rows_of(barycentric, np.float32),
-        flat(mesh.triangle_maps),
-        flat(mesh.vertex_maps),
+        _maps(mesh.triangle_maps),
+        _maps(mesh.vertex_maps),
         flat(mesh.vertices),
         mesh.search.topology.corners.reshape(-1),
         out.numpy(),

@@ -66,7 +66,7 @@ def mlp_backward(
 ) -> Gradients:
     """Gradients of `mlp` given that of its output [N,out]; the same for any number of threads."""
     reference.check_mlp(x, weights, biases, group_bias, group)
-    plan, packed = _pack(weights, biases)
+    plan, packed = pack(weights, biases)
     count = len(x)
     blocks = -(-count // BLOCK)
     parts = max(1, min(PARTS, blocks // 4))
@@ -113,7 +113,7 @@ class _Mlp(torch.autograd.Function):
     ) -> Tensor:
         ctx.save_for_backward(x, group_bias, group, *layers)
         half = len(layers) // 2
-        plan, packed = _pack(layers[:half], layers[half:])
+        plan, packed = pack(layers[:half], layers[half:])
         out = torch.empty(len(x), len(layers[-1]))
         arrays = (*_rows(x), packed, plan, *_group_arrays(group_bias, group), out.numpy())
         run_chunks(_forward_samples, len(x), CHUNK, *arrays)
@@ -151,7 +151,7 @@ def _sums_size(plan: np.ndarray) -> int:
     return int(plan[-1, GRAD_BIAS] + plan[-1, OUT_PAD])
 
 
-def _pack(weights: Sequence[Tensor], biases: Sequence[Tensor]) -> tuple[np.ndarray, np.ndarray]:
+def pack(weights: Sequence[Tensor], biases: Sequence[Tensor]) -> tuple[np.ndarray, np.ndarray]:
     """The plan, and in one array all weights as `tiles.multiply` wants them: padded, both ways."""
     plan = _plan((weights[0].shape[1], *(len(bias) for bias in biases)))
     last = plan[-1]
@@ -224,7 +224,7 @@ def _pack_layer(weight, bias, row, packed):
 
 
 @njit(cache=True, nogil=True)
-def _scratch(plan):
+def workspace(plan):
     """Room for a block's inputs and the results of all layers; products may read a little past."""
     last = plan[-1]
     return np.zeros(last[HIDDEN] + BLOCK * last[OUT_PAD] + ROWS * LANES, np.float32)
@@ -280,7 +280,7 @@ def _group_rows(begin, count, row, packed, bias_rows, group, work):
 
 
 @njit(cache=True, nogil=True)
-def _layers(begin, count, rows, layers, x, x_at, x_step, x_stride,
+def through_layers(begin, count, rows, layers, x, x_at, x_step, x_stride,
             packed, plan, bias_rows, group, work):  # fmt: skip
     """The first `layers` layers of `rows` samples, of which `count` are real; results in work.
 
@@ -307,7 +307,7 @@ def _layers(begin, count, rows, layers, x, x_at, x_step, x_stride,
 
 @njit(cache=True, nogil=True)
 def _forward_samples(start, stop, x, turned, packed, plan, bias_rows, group, out):
-    work = _scratch(plan)
+    work = workspace(plan)
     zero, no = np.int64(0), np.bool_(False)
     flat = x.ravel()
     first, last = plan[0], plan[-1]
@@ -321,7 +321,7 @@ def _forward_samples(start, stop, x, turned, packed, plan, bias_rows, group, out
             a, at, step, stride = flat, begin, 1, x.shape[1]
         else:
             a, at, step, stride = flat, begin * first[IN], first[IN], 1
-        _layers(begin, count, count, len(plan), a, at, step, stride,
+        through_layers(begin, count, count, len(plan), a, at, step, stride,
                 packed, plan, bias_rows, group, work)  # fmt: skip
         _copy_out(work, last[HIDDEN], last[OUT_PAD], out, no, begin, count)
 
@@ -329,7 +329,7 @@ def _forward_samples(start, stop, x, turned, packed, plan, bias_rows, group, out
 @njit(cache=True, nogil=True)
 def _backward_parts(first, end, size, x, turned, packed, plan, bias_rows, group, grad_out, grad_x,
                     sums, spans, group_sums):  # fmt: skip
-    work = _scratch(plan)
+    work = workspace(plan)
     slopes = np.zeros_like(work)
     zero, one, block = np.int64(0), np.int64(1), np.int64(BLOCK)
     plain, no = np.int64(PLAIN), np.bool_(False)
@@ -341,7 +341,7 @@ def _backward_parts(first, end, size, x, turned, packed, plan, bias_rows, group,
         for begin in range(part * size, stop, BLOCK):
             count = min(BLOCK, stop - begin)
             _copy_in(x, turned, begin, count, work, zero, start[IN_PAD])
-            _layers(begin, count, block, len(plan) - 1, work, zero, start[IN_PAD], one,
+            through_layers(begin, count, block, len(plan) - 1, work, zero, start[IN_PAD], one,
                     packed, plan, bias_rows, group, work)  # fmt: skip
             _copy_in(grad_out, no, begin, count, slopes, last[HIDDEN], last[OUT_PAD])
             for layer in range(len(plan) - 1, -1, -1):

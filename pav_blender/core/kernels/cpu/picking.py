@@ -96,7 +96,7 @@ def _choose(ray, first, last, origins, directions, jitter, step, bricks, brick_c
         row = bricks[(u * brick_count + v) * brick_count + w]
         if row < 0:
             # up to where the ray leaves the bricks that are clear as well
-            leave = min(_until(x, dx, u, -row), _until(y, dy, v, -row), _until(z, dz, w, -row))
+            leave = min(until(x, dx, u, -row), until(y, dy, v, -row), until(z, dz, w, -row))
             k += max(np.int64(min(leave / step, np.float32(last - k))), 0)
             continue
         u = int((x - np.float32(u)) * BRICK)
@@ -129,7 +129,7 @@ def _choose(ray, first, last, origins, directions, jitter, step, bricks, brick_c
 
 
 @njit(**INLINE)
-def _until(x, d, cell, clear):
+def until(x, d, cell, clear):
     """How far along the ray x leaves the cells that are nearer than `clear` to this one."""
     if d > 0:
         return (np.float32(cell + clear) - x) / d

@@ -94,8 +94,8 @@ def _spread(typing, table, width, row, share, source, first):
     return types.void(table, width, row, share, source, first), generate
 
 
-_mix3 = _mixer(3)
-_mix4 = _mixer(4)
+mix3 = _mixer(3)
+mix4 = _mixer(4)
 
 
 @njit(cache=True, nogil=True)
@@ -103,10 +103,10 @@ def read_rows(table, width, index, weight, corners, count, out, begin):
     """Rows of out from `begin` on: what `count` samples read from table; corners is 3 or 4."""
     if corners == 4:
         for i in range(count):
-            _mix4(table, width, index, weight, i, out, (begin + i) * width)
+            mix4(table, width, index, weight, i, out, (begin + i) * width)
     else:
         for i in range(count):
-            _mix3(table, width, index, weight, i, out, (begin + i) * width)
+            mix3(table, width, index, weight, i, out, (begin + i) * width)
 
 
 @njit(cache=True, nogil=True)
@@ -125,7 +125,7 @@ def add_rows(table, width, index, weight, corners, count, grad_out, begin, part,
 
 
 @njit(cache=True, nogil=True)
-def _texel(coordinate, size):
+def texel(coordinate, size):
     """Texel below a coordinate in [0, 1] and how far the coordinate lies toward the next."""
     c = coordinate if coordinate > 0 else np.float32(0)
     c = c if c < 1 else np.float32(1)
@@ -140,8 +140,8 @@ def locate_texels(size, appearance, uv, begin, count, index, weight):
     """The four texels round every sample from `begin` on, and their weights."""
     right = min(1, size - 1)
     for i in range(count):
-        u, fu = _texel(uv[begin + i, 0], size)
-        v, fv = _texel(uv[begin + i, 1], size)
+        u, fu = texel(uv[begin + i, 0], size)
+        v, fv = texel(uv[begin + i, 1], size)
         row = (appearance[begin + i] * size + v) * size + u
         gu = np.float32(1) - fu
         gv = np.float32(1) - fv

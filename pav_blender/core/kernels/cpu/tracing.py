@@ -1,0 +1,406 @@
+"""Whole rays of a picture in one compiled pass, for a field that is held still.
+
+A few hundred neighbouring rays advance together, a wave at a time. Each chooses runs of places that
+may hold something, by the voxels of the pose, and looks at the middle of each; where that shows,
+the places beside it are looked at too, so that what is empty is passed coarsely and a surface is
+met finely. `rendering.render` does the same step by step, without runs.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numba import njit
+
+from ..reference.picking import BRICK
+from ..structures import Clearance, Frozen, PosedMesh, Probing, Traced, Voxels
+from .frozen import ROOM, arrays_of, columns_of, densities, room_for, shade
+from .lanes import LANES, load, splat_int
+from .marching import clear_cells, flat, locate, rows_of, walk
+from .mlp import BLOCK, workspace
+from .picking import until
+from .search import INLINE, OPTIONS, STACK
+from .threads import run_chunks
+
+GROUP = 256  # rays that advance together
+_NONE, _WANTED = -1, -2
+
+
+def thickness(voxels: Voxels, guide: torch.Tensor) -> torch.Tensor:
+    """What a guide [G, G, G] knows of the density in each voxel [B, 4, 4, 4], -1 where it has no
+    cell."""
+    found = torch.empty(voxels.cells.shape)
+    cells = rows_of(voxels.cells.view(-1), np.int32)
+    run_chunks(_look_up, len(cells), 1 << 16, cells, flat(guide), found.view(-1).numpy())
+    return found
+
+
+@njit(**OPTIONS)
+def _look_up(start, stop, cells, guide, out):
+    for i in range(start, stop):
+        out[i] = guide[cells[i]] if cells[i] >= 0 else np.float32(-1)
+
+
+def trace(
+    mesh: PosedMesh,
+    voxels: Voxels,
+    thickness: torch.Tensor,
+    field: Frozen,
+    origins: torch.Tensor,
+    directions: torch.Tensor,
+    first: torch.Tensor,
+    last: torch.Tensor,
+    step: float,
+    *,
+    clearance: Clearance,
+    band: float,
+    still: torch.Tensor,
+    rotation: torch.Tensor,
+    probing: Probing,
+) -> Traced:
+    """Rays [R] to their ends, on this thread alone.
+
+    thickness [B, 4, 4, 4]: the density (1/m) that a guide knows in each voxel, negative where
+    nothing can be; first, last [R] int32: the lattice indices to look at, places lying half a step
+    further; band: metres from the mesh beyond which nothing is; still [3, 4]: posed points to where
+    the shoulders do not move; rotation [3, 3]: directions to the head's axes (as rows).
+    """
+    count = len(origins)
+    traced = Traced(torch.zeros(count, 4), torch.zeros(count), torch.ones(count), 0)
+    half = torch.full((count,), 0.5)
+    walked = walk(mesh, origins, directions, first, last, half, step, clearance, band)
+    space = (
+        rows_of(voxels.bricks.view(-1), np.int32),
+        len(voxels.bricks),
+        flat(thickness),
+        flat(voxels.box_min),
+        np.float32(voxels.scale),
+    )
+    unit = flat(clearance.box_min), np.float32(clearance.box_scale)
+    evaluations = _trace(
+        count,
+        walked,
+        space,
+        (*unit, rows_of(still, np.float32), rows_of(rotation, np.float32)),
+        arrays_of(field),
+        (
+            probing.width,
+            np.float32(probing.share),
+            max(probing.longest, probing.probe),
+            probing.probe,
+        ),
+        tuple(
+            np.float32(x) for x in (probing.tolerance, probing.transmittance, probing.negligible)
+        ),
+        tuple(values.numpy() for values in traced[:3]),
+    )
+    return traced._replace(evaluations=evaluations)
+
+
+@njit(**INLINE)
+def _runs(ray, first, last, rays, space, left, lengths_of, begins,
+            lengths):  # fmt: skip
+    """Places of one ray in runs, each looked at in its middle: how many runs, where to go on.
+
+    A run is up to `probe` places that are in some cell, or up to `longest` that add no more than
+    `share` to the pixel by the guide.
+    """
+    origins, directions, step = rays
+    bricks, brick_count, thin, corner, scale = space
+    width, share, longest, probe = lengths_of
+    ox = (origins[ray, 0] - corner[0]) * scale
+    oy = (origins[ray, 1] - corner[1]) * scale
+    oz = (origins[ray, 2] - corner[2]) * scale
+    dx, dy, dz = directions[ray, 0] * scale, directions[ray, 1] * scale, directions[ray, 2] * scale
+    end = np.float32(brick_count)
+    count, length, added = -1, 0, np.float32(0.0)
+    k = first
+    while k <= last:
+        t = (np.float32(k) + np.float32(0.5)) * step
+        x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
+        k += 1
+        if not (min(x, y, z) >= 0 and max(x, y, z) < end):
+            continue
+        u, v, w = int(x), int(y), int(z)
+        row = bricks[(u * brick_count + v) * brick_count + w]
+        if row < 0:
+            # up to where the ray leaves the bricks that are clear as well
+            leave = min(until(x, dx, u, -row), until(y, dy, v, -row), until(z, dz, w, -row))
+            k += max(np.int64(min(leave / step, np.float32(last - k))), 0)
+            continue
+        u = int((x - np.float32(u)) * BRICK)
+        v = int((y - np.float32(v)) * BRICK)
+        w = int((z - np.float32(w)) * BRICK)
+        density = thin[((row * BRICK + u) * BRICK + v) * BRICK + w]
+        if density < 0:
+            continue
+        more = left * min(density * step, np.float32(1))
+        together = (
+            length > 0
+            and begins[count] + length == k - 1
+            and (length < probe or (length < longest and added + more <= share))
+        )
+        if together:
+            length += 1
+            added += more
+            lengths[count] = length
+            continue
+        if count + 1 == width:
+            return width, k - 1
+        count += 1
+        begins[count], lengths[count] = k - 1, 1
+        length, added = 1, more
+    return count + 1, k
+
+
+@njit(**INLINE)
+def _find(start, stop, base, asked, count, rays, surface, grid, frames, feet, packet,
+          samples):  # fmt: skip
+    """Where requests start..stop lie: each gets a sample, from `count` on, or -1 where nothing can
+    be; returns how many samples there are then."""
+    origins, directions, step = rays
+    arrays, triangle_maps, vertex_maps, vertices, mesh_corners, band = surface
+    cells, size, grid_corner, grid_scale = grid
+    unit_corner, unit_scale, still, _ = frames
+    want_row, want_k, sample_of = asked
+    stack, scratch, points, near, canonical, distances, weights, found = packet
+    triangle, barycentric, distance, places, resting = samples
+    for begin in range(start, stop, LANES):
+        lanes = min(LANES, stop - begin)
+        for i in range(LANES):
+            row = want_row[begin + min(i, lanes - 1)]
+            t = (np.float32(want_k[begin + min(i, lanes - 1)]) + np.float32(0.5)) * step
+            known = feet[row, 0] < np.inf  # else a neighbour's nearest point is a bound as well
+            for axis in range(3):
+                along = t * directions[base + row, axis]
+                points[axis * LANES + i] = origins[base + row, axis] + along
+                if known:
+                    near[axis * LANES + i] = feet[row, axis]
+        px, py, pz = load(points, 0), load(points, LANES), load(points, 2 * LANES)
+        locate(arrays, triangle_maps, vertex_maps, vertices, mesh_corners, px, py, pz,
+               splat_int(0) < splat_int(1), band, stack, scratch, near, found, weights, canonical,
+               distances)  # fmt: skip
+        for i in range(lanes):
+            sample_of[begin + i] = -1
+            row = want_row[begin + i]
+            for axis in range(3):
+                feet[row, axis] = near[axis * LANES + i]
+            if found[i] < 0 or not distances[i] <= band:
+                continue
+            x, y, z = canonical[i], canonical[LANES + i], canonical[2 * LANES + i]
+            if clear_cells(cells, size, grid_corner, grid_scale, x, y, z) > 0:
+                continue
+            sample_of[begin + i] = count
+            triangle[count] = found[i]
+            distance[count] = distances[i]
+            for axis in range(3):
+                barycentric[count, axis] = weights[axis * LANES + i]
+                place = (canonical[axis * LANES + i] - unit_corner[axis]) * unit_scale
+                places[axis, count] = min(max(place, np.float32(0)), np.float32(1))
+                place = still[axis, 3]
+                for k in range(3):
+                    place += still[axis, k] * points[k * LANES + i]
+                place = (place - unit_corner[axis]) * unit_scale
+                resting[axis, count] = min(max(place, np.float32(0)), np.float32(1))
+            count += 1
+    return count
+
+
+@njit(**INLINE)
+def _ask_middles(living, alive, runs, asked):
+    """The middles of all runs, sixteen rays side by side; returns how many."""
+    chosen, begins, lengths, middle, before, after = runs
+    want_row, want_k, _ = asked
+    count = 0
+    for begin in range(0, living, LANES):
+        for slot in range(begins.shape[1]):
+            for a in range(begin, min(begin + LANES, living)):
+                if slot < chosen[a]:
+                    want_row[count] = alive[a]
+                    want_k[count] = begins[a, slot] + lengths[a, slot] // 2
+                    middle[a, slot] = count
+                    before[a, slot] = after[a, slot] = _NONE
+                    count += 1
+    return count
+
+
+@njit(**INLINE)
+def _mark(living, alive, base, runs, sample_of, sigma, step, lefts, tolerance, transmittance):
+    """Which runs to take apart: before its middle, where a run shows, and after it what lies behind
+    the middle of the run that comes before; after its own where light still passes."""
+    chosen, begins, lengths, middle, before, after = runs
+    for a in range(living):
+        left = lefts[base + alive[a]]
+        for slot in range(chosen[a]):
+            s = sample_of[middle[a, slot]]
+            if s < 0:
+                continue
+            optical = sigma[s] * step
+            passes = np.exp(-optical * np.float32(lengths[a, slot]))
+            if left * (np.float32(1) - passes) > tolerance:
+                before[a, slot] = _WANTED
+                if slot > 0 and begins[a, slot - 1] + lengths[a, slot - 1] == begins[a, slot]:
+                    after[a, slot - 1] = _WANTED
+                if left * np.exp(-optical) > tolerance:
+                    after[a, slot] = _WANTED
+            left *= passes
+            if left < transmittance:
+                break
+
+
+@njit(**INLINE)
+def _ask_rest(living, alive, runs, asked, count):
+    """The places beside the middles of marked runs; returns how many requests there are then."""
+    chosen, begins, lengths, _, before, after = runs
+    want_row, want_k, _ = asked
+    for begin in range(0, living, LANES):
+        for slot in range(begins.shape[1]):
+            for part in (before, after):
+                for a in range(begin, min(begin + LANES, living)):
+                    if slot >= chosen[a] or part[a, slot] != _WANTED:
+                        continue
+                    part[a, slot] = count
+                    half = lengths[a, slot] // 2
+                    low = 0 if part is before else half + 1
+                    high = half if part is before else lengths[a, slot]
+                    for place in range(low, high):
+                        want_row[count] = alive[a]
+                        want_k[count] = begins[a, slot] + place
+                        count += 1
+    return count
+
+
+@njit(**INLINE)
+def _add_up(a, ray, runs, asked, sigma, step, left, depth, negligible, row, showing, shown,
+            shown_row, shown_weight):  # fmt: skip
+    """One ray through its samples: what is left of it, its depth, and how many samples show."""
+    chosen, _, lengths, middle, before, after = runs
+    _, want_k, sample_of = asked
+    for slot in range(chosen[a]):
+        half = lengths[a, slot] // 2
+        lower, upper = before[a, slot], after[a, slot]
+        for place in range(lengths[a, slot]):
+            wide = 1
+            if place < half:
+                if lower < 0:
+                    continue
+                request = lower + place
+            elif place > half:
+                if upper < 0:
+                    continue
+                request = upper + place - half - 1
+            else:  # the middle stands for what was not looked at
+                request = middle[a, slot]
+                wide += half if lower < 0 else 0
+                wide += lengths[a, slot] - half - 1 if upper < 0 else 0
+            s = sample_of[request]
+            if s < 0:
+                continue
+            length = step * np.float32(wide)
+            seen = left * (np.float32(1) - np.exp(-sigma[s] * length))
+            depth += seen * (np.float32(want_k[request]) + np.float32(0.5)) * step
+            left -= seen
+            if seen > negligible * length:
+                shown[showing], shown_row[showing] = s, row
+                shown_weight[showing] = seen
+                showing += 1
+    return left, depth, showing
+
+
+@njit(**OPTIONS)
+def _trace(total, walked, space, frames, field, lengths_of, limits, outputs):
+    (arrays, triangle_maps, vertex_maps, vertices, mesh_corners, origins, directions, first, last,
+     _, step, cells, size, grid_corner, grid_scale, band) = walked  # fmt: skip
+    surface = arrays, triangle_maps, vertex_maps, vertices, mesh_corners, band
+    rays = origins, directions, step
+    grid = cells, size, grid_corner, grid_scale
+    width, longest = lengths_of[0], lengths_of[2]
+    tolerance, transmittance, negligible = limits
+    out_colour, out_depth, out_left = outputs
+    columns = columns_of(field)
+    most = GROUP * width * longest  # requests of a wave, every run taken apart
+    room = most + ROOM
+    packet = (
+        np.empty(STACK, np.int32),
+        np.empty(LANES, np.float32),
+        np.empty(3 * LANES, np.float32),
+        np.full(3 * LANES, np.inf, np.float32),
+        np.empty(3 * LANES, np.float32),
+        np.empty(LANES, np.float32),
+        np.empty(3 * LANES, np.float32),
+        np.empty(LANES, np.int32),
+    )
+    alive = np.empty(GROUP, np.int32)
+    feet = np.empty((GROUP, 3), np.float32)
+    following = np.zeros(GROUP, np.int32)
+    runs = (
+        np.zeros(GROUP, np.int32),  # how many a ray has
+        np.zeros((GROUP, width), np.int32),  # lattice index each begins at
+        np.zeros((GROUP, width), np.int32),  # length
+        np.zeros((GROUP, width), np.int32),  # the request of its middle
+        np.zeros((GROUP, width), np.int32),  # the first request of what lies before that, or _NONE
+        np.zeros((GROUP, width), np.int32),  # and after
+    )
+    chosen, begins, lengths = runs[:3]
+    # requests: ray, lattice index, sample or -1
+    asked = np.zeros(most, np.int32), np.zeros(most, np.int32), np.zeros(most, np.int32)
+    samples = (
+        np.zeros(room, np.int32),  # triangle
+        np.zeros((room, 3), np.float32),  # barycentrics
+        np.zeros(room, np.float32),  # distance
+        np.zeros((3, room), np.float32),  # canonical place in the unit box
+        np.zeros((3, room), np.float32),  # the place that rests with the shoulders
+    )
+    work = room_for(field, most)
+    inputs = np.zeros(room * columns, np.float32)
+    sigma = np.zeros(room, np.float32)
+    views = np.zeros((GROUP, field[2][2].shape[1]), np.float32)
+    viewed = np.zeros(GROUP, np.bool_)
+    shown = np.zeros(room, np.int32)
+    shown_row = np.zeros(room, np.int32)
+    shown_weight = np.zeros(room, np.float32)
+    lit = np.zeros((BLOCK + ROOM) * columns, np.float32)
+    colour_work = workspace(field[2][0])
+    evaluations = 0
+    for base in range(0, total, GROUP):
+        living = 0
+        for i in range(min(GROUP, total - base)):
+            viewed[i] = False
+            feet[i, 0] = np.inf
+            if first[base + i] <= last[base + i]:
+                alive[living] = i
+                living += 1
+        while living > 0:
+            for a in range(living):
+                ray = base + alive[a]
+                chosen[a], following[a] = _runs(
+                    ray, first[ray], last[ray], rays, space, out_left[ray], lengths_of, begins[a],
+                    lengths[a])  # fmt: skip
+            requests = _ask_middles(living, alive, runs, asked)
+            count = _find(0, requests, base, asked, 0, rays, surface, grid, frames, feet, packet,
+                          samples)  # fmt: skip
+            densities(0, count, field, mesh_corners, samples, work, inputs, sigma)
+            if tolerance < 1:
+                _mark(living, alive, base, runs, asked[2], sigma, step, out_left, tolerance,
+                      transmittance)  # fmt: skip
+                known, middles = requests, count
+                requests = _ask_rest(living, alive, runs, asked, known)
+                count = _find(known, requests, base, asked, middles, rays, surface, grid, frames,
+                              feet, packet, samples)  # fmt: skip
+                densities(middles, count, field, mesh_corners, samples, work, inputs, sigma)
+            evaluations += count
+            showing, going_on = 0, 0
+            for a in range(living):
+                row = alive[a]
+                ray = base + row
+                out_left[ray], out_depth[ray], showing = _add_up(
+                    a, ray, runs, asked, sigma, step, out_left[ray], out_depth[ray], negligible,
+                    row, showing, shown, shown_row, shown_weight)  # fmt: skip
+                first[ray] = following[a]
+                if following[a] <= last[ray] and out_left[ray] > transmittance:
+                    alive[going_on] = row
+                    going_on += 1
+            living = going_on
+            shade(showing, base, rays, frames[3], field, inputs, shown, shown_row, shown_weight,
+                  views, viewed, lit, colour_work, out_colour)  # fmt: skip
+    return evaluations

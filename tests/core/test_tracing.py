@@ -1,0 +1,117 @@
+"""Whole rays compiled (`kernels/cpu/tracing`) against the field itself, step by step."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from pav_blender.core.config import Config
+from pav_blender.core.evaluation.metrics import over, psnr
+from pav_blender.core.field.field import condition
+from pav_blender.core.field.frozen import freeze
+from pav_blender.core.rendering import render as rendering
+from pav_blender.core.rendering.render import RenderSettings, render
+from pav_blender.core.training.frames import camera_of
+from pav_blender.core.training.prepare import load_training_frames, new_avatar
+
+EVERY = RenderSettings(probe=1, longest=1)
+SMALL = Config(levels=6, log2_entries=12, finest_resolution=128, occupancy_resolution=48)
+FIELDS = {
+    "default": {},
+    "no shoulders": {"shoulder_levels": 0},
+    "texture": {"appearance": "surface", "latent_size": 32},
+    "one vector": {"appearance": "global", "global_channels": 24},
+    "no appearance": {"appearance": "none"},
+    "no offset": {"density_offset": False},
+    "offset without geometry": {"offset_sees_geometry": False},
+    "expression": {"sees_expression": True},
+    "deep": {"density_layers": 2, "colour_layers": 3, "offset_layers": 2, "hidden": 32},
+    "rigid frames": {"frames": "rigid"},
+    "fog": {"start_on_mesh": False, "density_bias": -3.0},
+    "no code": {"appearance_code": False},
+}
+
+
+@pytest.fixture(scope="module")
+def frames(toy):
+    return load_training_frames(toy)
+
+
+@pytest.fixture(scope="module")
+def pose(toy):
+    clip = toy.clip("plain")
+    camera = camera_of(clip, 7).resized(40, 40)
+    vertices = toy.posed(clip, np.array([7]))[0]
+    return {"vertices": vertices, "camera": camera, "expression": clip.expression[7]}
+
+
+def stirred(toy, frames, changes):
+    """An untrained avatar of these settings, every number of which matters."""
+    torch.manual_seed(0)
+    avatar = new_avatar(toy, frames, dataclasses.replace(SMALL, **changes))
+    with torch.no_grad():
+        for name, value in avatar.field.named_parameters():
+            value.add_(torch.randn_like(value) * (0.3 if "latent" in name else 0.1))
+        if avatar.field.offset is not None:
+            avatar.field.offset.weights[-1].mul_(3)
+    return avatar
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_every_kind_of_field_looks_the_same(toy, frames, pose, name, monkeypatch):
+    avatar = stirred(toy, frames, FIELDS[name])
+    blend = {"plain": 0.7, "bushy": 0.3}
+    whole = render(avatar, appearance=blend, settings=EVERY, **pose)
+    monkeypatch.setattr(rendering, "_whole", rendering._by_waves)
+    steps = render(avatar, appearance=blend, settings=EVERY, **pose)
+    assert (steps.rgba[..., 3] > 0.5).mean() > 0.05
+    assert steps.rgba[..., :3][steps.rgba[..., 3] > 0.5].std() > 0.01
+    assert psnr(over(whole.rgba, 1.0), over(steps.rgba, 1.0)) > 75
+    assert whole.evaluations == pytest.approx(steps.evaluations, rel=1e-3)
+
+
+def test_evaluations_are_those_of_the_field(toy_avatar, pose, monkeypatch):
+    """Counted at the field itself, where every place is walked to."""
+    usual = render(toy_avatar, appearance="plain", **pose)  # the guide is known from here on
+    counted, field = [0], toy_avatar.field
+    geometry = field.geometry
+
+    def count(samples, *rest):
+        counted[0] += len(samples.canonical)
+        return geometry(samples, *rest)
+
+    monkeypatch.setattr(field, "geometry", count)
+    walked = RenderSettings(skip=False)
+    dense = render(toy_avatar, appearance="plain", settings=walked, **pose)
+    assert dense.evaluations == counted[0] > 1000
+    assert 100 < usual.evaluations < dense.evaluations / 2
+
+
+@pytest.mark.parametrize("name", ["default", "one vector", "offset without geometry"])
+def test_a_frozen_field_is_the_field(toy, frames, name):
+    """Folded biases and widened weights, in float64, against the networks as they are."""
+    avatar = stirred(toy, frames, FIELDS[name])
+    field = avatar.field.double()
+    seen = condition(avatar.config, np.zeros(len(avatar.expression_names)), np.ones(3)).double()
+    worn = field.blend(torch.tensor([0.2, 0.8]))
+    frozen = freeze(field, seen, worn)
+    geometry = torch.randn(5, avatar.config.geometry_channels, dtype=torch.float64)
+    with torch.no_grad():
+        weight, bias = frozen.density.weights[0], frozen.density.biases[0]
+        x = torch.randn(5, weight.shape[1], dtype=torch.float64)
+        whole = x @ field.density.weights[0].T + field.density.biases[0]
+        whole = whole + field.density.group_weight @ seen
+        torch.testing.assert_close(x @ weight.T + bias, whole)
+        rows = frozen.latent[:1].expand(5, -1)
+        embedding = worn.latent[0, :1] if avatar.config.appearance == "vertex" else worn.latent
+        if worn.code.shape[1]:
+            embedding = embedding + worn.code
+        embedding = embedding.expand(5, -1)
+        sees = [embedding, geometry[:, 1:]][: 1 + avatar.config.offset_sees_geometry]
+        own = torch.cat(sees, 1) @ field.offset.weights[0].T + field.offset.biases[0]
+        own = own + field.offset.group_weight @ seen
+        folded = torch.cat([rows, geometry], 1) @ frozen.offset.weights[0].T
+        torch.testing.assert_close(folded + frozen.offset.biases[0], own)
