@@ -38,12 +38,12 @@ def run(options: Options, progress: Report | None = None) -> tuple[dict[str, Any
     points = []
     trainer = None
     for part in _BUDGETS:
-        trainer, point = _trained(collection, frames, Config(), part * options.minutes, progress)
+        trainer, point = trained(collection, frames, Config(), part * options.minutes, progress)
         points.append({"method": "ours", **point})
     assert trainer is not None
-    iteration = _iteration(trainer)
+    iteration = iteration_costs(trainer)
     plain = _plain_iteration(trainer.avatar, iteration["samples"])
-    _, point = _trained(collection, frames, Config.paper(), options.minutes, progress)
+    _, point = trained(collection, frames, Config.paper(), options.minutes, progress)
     points.append({"method": "paper", **point})
     show(points)
     goal, paper_minutes = point["head_psnr"], point["minutes"]
@@ -71,15 +71,18 @@ def run(options: Options, progress: Report | None = None) -> tuple[dict[str, Any
     return fields, claims
 
 
-def _trained(
+def trained(
     collection: Collection,
     frames: list[Frame],
     config: Config,
     minutes: float,
     progress: Report | None,
+    *,
+    device: str = "cpu",
 ) -> tuple[Trainer, dict[str, Any]]:
     """A training planned for `minutes`, and how good it was."""
-    trainer = Trainer(new_avatar(collection, frames, config), frames, minutes=minutes)
+    avatar = new_avatar(collection, frames, config)
+    trainer = Trainer(avatar, frames, minutes=minutes, device=device)
     while trainer.done < 1:
         with torch_alone():
             status = trainer.iterate()
@@ -96,17 +99,17 @@ def _trained(
     }
 
 
-def _iteration(trainer: Trainer) -> dict[str, Any]:
+def iteration_costs(trainer: Trainer) -> dict[str, Any]:
     """Milliseconds of iterations of 4096 rays as they are late in a training."""
     times, fields, samples = [], [], []
     with torch_alone():
         for _ in range(_SETTLE + _TIMED):
             trainer.status.rays = _RAYS
             started = time.perf_counter()
-            trainer.iterate()
+            trainer.iterate()  # ends with numbers on the CPU: nothing is under way after it
             times.append(time.perf_counter() - started)
             samples.append(trainer.status.samples_per_ray)
-        drawn = _samples(trainer.avatar, int(np.mean(samples) * _RAYS))
+        drawn = _samples(trainer.avatar, int(np.mean(samples) * _RAYS)).to(trainer.device)
         for _ in range(8):
             started = time.perf_counter()
             _fields(trainer.avatar, drawn)

@@ -13,7 +13,7 @@ from ..studio import DEFAULT_COLLECTION
 SUMMARY = "Measure speed against error on a studio avatar; tables, plots and claims."
 EXAMPLE = "pav bench render --out out/bench --check"
 
-NAMES = ("render", "train", "kernels", "scale")
+NAMES = ("render", "train", "kernels", "scale", "devices")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -22,7 +22,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--collection", type=Path, help="another collection than the built-in one")
     parser.add_argument("--repeats", type=int, default=3, help="of which the least time counts")
     parser.add_argument(
-        "--minutes", type=float, default=8.0, help="of the paper's preset, `train` only"
+        "--minutes",
+        type=float,
+        default=8.0,
+        help="of the paper's preset in `train`, of each training in `devices`",
     )
     parser.add_argument("--check", action="store_true", help="exit 1 where a claim is not met")
 

@@ -26,6 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--frames", metavar="A-B", help="frame numbers, e.g. 10-20 or 5")
     parser.add_argument("--depth", action="store_true", help="write EXR with depth (.exr)")
     parser.add_argument("--quality", default="final", help="preview, final or reference")
+    parser.add_argument("--device", default="cpu", help="of the networks: cpu, cuda or mps")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -46,6 +47,7 @@ def run(args: argparse.Namespace) -> int:
         frames=args.frames,
         depth=args.depth,
         quality=args.quality,
+        device=args.device,
         progress=progress,
     )
     print(f"{len(written)} pictures, the last {written[-1]}")
@@ -58,6 +60,7 @@ def _render_blend(args: argparse.Namespace, progress: Progress) -> int:
     from ..core.rendering.sequence import check_pattern
 
     taken = [name for name in ("track", "size", "frames", "depth") if getattr(args, name)]
+    taken += ["device"] * (args.device != "cpu")
     if taken:
         raise InputError(f"--{taken[0]} does not go with a .blend: it is set in the scene")
     check_pattern(args.out, several=True, appearances=2 if args.appearance == "all" else 1)

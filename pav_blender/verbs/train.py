@@ -20,6 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--minutes", type=float, help="plan for this long")
     parser.add_argument("--iterations", type=int, help="or for so many iterations (15000)")
     parser.add_argument("--preset", default="default", help="default, or paper: its own settings")
+    parser.add_argument("--device", default="cpu", help="of the networks: cpu, cuda or mps")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--resume", action="store_true", help="go on from the last checkpoint")
 
@@ -41,6 +42,7 @@ class StopSignal:
 
 def run(args: argparse.Namespace) -> int:
     from ..core.config import Config
+    from ..core.devices import device_of
     from ..core.training.train import train
 
     changes = {"seed": args.seed}
@@ -53,6 +55,7 @@ def run(args: argparse.Namespace) -> int:
         config,
         minutes=args.minutes,
         resume=args.resume,
+        device=device_of(args.device),
         progress=Progress("train", as_json=args.json_progress),
         loading=Progress("read", as_json=args.json_progress),
         should_stop=StopSignal(),

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
@@ -50,6 +50,9 @@ class Samples:
     ray: torch.Tensor
     condition: torch.Tensor
     direction: torch.Tensor
+
+    def to(self, device: torch.device) -> Samples:
+        return Samples(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
 
 
 TURN = 3
@@ -252,6 +255,11 @@ class Field(nn.Module):
         """Density [N] per metre and colour [N, 3], sRGB in [0, 1]; arguments as `geometry`."""
         density, inputs = self.geometry(samples, worn, encoded)
         return density, self.shade(inputs, samples.direction, samples.ray)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the networks and tables are."""
+        return self.tables.device
 
     @property
     def worn(self) -> Worn:

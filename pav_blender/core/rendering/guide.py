@@ -32,7 +32,8 @@ def guide(avatar: Avatar, deformer: Deformer, worn: Worn, occupied: np.ndarray) 
             unit, unit, triangle, barycentric, distance, zeros, zeros, zeros,
             condition(avatar.config, still, np.array(turn, np.float32))[None], torch.zeros(1, 3),
         )  # fmt: skip
-        found = torch.maximum(found, avatar.field.geometry(samples, worn)[0])
+        density = avatar.field.geometry(samples.to(avatar.field.device), worn)[0]
+        found = torch.maximum(found, density.cpu())
     grid = torch.zeros(1, 1, count, count, count)
     grid[0, 0][torch.from_numpy(occupied)] = found
     return torch.nn.functional.max_pool3d(grid, 3, 1, 1)[0, 0]

@@ -28,6 +28,9 @@ class RayBatch:
     def __len__(self) -> int:
         return len(self.cosine)
 
+    def to(self, device: torch.device) -> RayBatch:
+        return RayBatch(self.origins.to(device), self.directions.to(device), self.cosine.to(device))
+
     def pick(self, rows: torch.Tensor) -> RayBatch:
         return RayBatch(self.origins[rows], self.directions[rows], self.cosine[rows])
 

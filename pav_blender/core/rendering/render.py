@@ -6,6 +6,7 @@ import threading
 import weakref
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -24,6 +25,7 @@ from .guide import guide
 from .rays import RayBatch, camera_rays, pack, samples_of, tiled
 
 Appearance = str | Mapping[str, float]
+_FAR_WAVE = 24  # samples a ray between two looks, where every look waits for a device
 
 
 @dataclass(frozen=True)
@@ -82,11 +84,18 @@ class Scene:
     clearance: Clearance
     voxels: Voxels
     guide: torch.Tensor
-    thickness: torch.Tensor
     stance: Stance
     condition: torch.Tensor
     worn: Worn
-    frozen: Frozen
+
+    @cached_property
+    def thickness(self) -> torch.Tensor:
+        """What the guide knows of the density in each voxel."""
+        return kernels.select("cpu").tracing.thickness(self.voxels, self.guide)
+
+    @cached_property
+    def frozen(self) -> Frozen:
+        return freeze(self.avatar.field, self.condition, self.worn)
 
 
 _deformers: weakref.WeakKeyDictionary[Avatar, Deformer] = weakref.WeakKeyDictionary()
@@ -175,18 +184,15 @@ def pose_scene(
     seen = condition(avatar.config, values.astype(np.float32), stands.turn)
     worn = avatar.field.blend(torch.from_numpy(weights))
     filled, guide = voxels(mesh, space, avatar.config.reach), guide_of(avatar, weights)
-    thickness = kernels.select("cpu").tracing.thickness(filled, guide)
     return Scene(
         avatar,
         mesh,
         space,
         filled,
         guide,
-        thickness,
         stands,
         seen,
         worn,
-        freeze(avatar.field, seen, worn),
     )
 
 
@@ -245,8 +251,10 @@ def _trace(
     scene: Scene, rays: RayBatch, settings: RenderSettings
 ) -> tuple[np.ndarray, np.ndarray, int]:
     """Straight RGBA [R, 4], depth along the camera's axis [R], and how many densities it took."""
-    run = _whole if settings.skip else _by_waves
-    colour, depth, left, evaluations = run(scene, rays, settings)
+    compiled = settings.skip and scene.avatar.field.device.type == "cpu"
+    run = _whole if compiled else _by_waves
+    *found, evaluations = run(scene, rays, settings)
+    colour, depth, left = (values.cpu() for values in found)
     opacity = 1 - left
     seen = (opacity > 1e-4) & (colour[:, 3] > 0)
     safe = torch.where(seen, opacity, 1.0)[:, None]
@@ -295,34 +303,37 @@ def _by_waves(scene: Scene, rays: RayBatch, settings: RenderSettings) -> Traced:
     """The same step by step, with the field as it is."""
     count, evaluations = len(rays), 0
     # the colours of what was worth a look, and how much of the ray that was
-    colour, depth, left = torch.zeros(count, 4), torch.zeros(count), torch.ones(count)
-    ops = kernels.select("cpu")
-    jitter = torch.full((count,), 0.5)
     field, reach = scene.avatar.field, scene.avatar.config.reach
+    device = field.device
+    colour = torch.zeros(count, 4, device=device)
+    depth, left = torch.zeros(count, device=device), torch.ones(count, device=device)
+    ops, adding = kernels.select("cpu"), kernels.select(device)
+    jitter = torch.full((count,), 0.5)
     around = (scene.voxels.box, 0.0) if settings.skip else (scene.mesh.vertices, reach)
     near, far = ops.marching.bounds(*around, rays.origins, rays.directions)
     first, last = ops.marching.lattice(near, far, jitter, settings.step)
     alive = (last >= first).nonzero()[:, 0]
     while len(alive):
         part = rays.pick(alive)
-        wave = _wave(scene, part, first[alive], last[alive], left[alive], settings)
+        wave = _wave(scene, part, first[alive], last[alive], left.cpu()[alive], settings)
         packed, slots = pack(wave, jitter[alive], settings.step)
         if len(packed):
             samples = samples_of(packed, scene.clearance, 0, scene.condition, part, scene.stance)
+            samples = samples.to(device)
             sigma, inputs = field.geometry(samples, scene.worn)
             evaluations += len(sigma)
-            ray = alive[packed.ray.long()]
+            ray = alive[packed.ray.long()].to(device)
             width = torch.full_like(sigma, settings.step)
             if isinstance(wave, Picks):
-                width *= wave.steps.view(-1)[slots]
-            weights = ops.marching.weigh(sigma, width, ray.int(), left)
-            depth.index_add_(0, ray, weights * packed.t)
+                width *= wave.steps.view(-1)[slots].to(device)
+            weights = adding.marching.weigh(sigma, width, ray.int(), left)
+            depth.index_add_(0, ray, weights * packed.t.to(device))
             shown = (weights > settings.negligible * width).nonzero()[:, 0]
             rgb = field.shade(inputs[shown], samples.direction, samples.ray[shown])
             weight = weights[shown, None]
             colour.index_add_(0, ray[shown], torch.cat([weight * rgb, weight], 1))
         first[alive] = wave.next
-        going = (wave.next <= last[alive]) & (left[alive] > settings.transmittance)
+        going = (wave.next <= last[alive]) & (left.cpu()[alive] > settings.transmittance)
         alive = alive[going]
     return Traced(colour, depth, left, evaluations)
 
@@ -337,14 +348,14 @@ def _wave(
 ) -> Picks | Wave:
     """The next samples of rays [R] that are to look at lattice indices first..last [R]."""
     ops = kernels.select("cpu")
+    far = scene.avatar.field.device.type != "cpu"
+    width = max(settings.wave, _FAR_WAVE) if far else settings.wave
     middle = torch.full((len(rays),), 0.5)
     lattice = rays.origins, rays.directions, first, last, middle
     space, reach = scene.clearance, scene.avatar.config.reach
     if not settings.skip:
         options = {"clearance": space, "band": reach, "leap_limit": 0.0}
-        return ops.marching.march(
-            scene.mesh, *lattice, settings.step, wave=settings.wave, **options
-        )
+        return ops.marching.march(scene.mesh, *lattice, settings.step, wave=width, **options)
     return ops.picking.pick(
         scene.mesh,
         scene.voxels,
@@ -355,5 +366,5 @@ def _wave(
         settings.step,
         clearance=space,
         band=reach,
-        thrift=Thrift(settings.wave, settings.share, settings.longest),
+        thrift=Thrift(width, settings.share, settings.longest),
     )

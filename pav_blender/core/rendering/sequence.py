@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ..collection import Clip, Collection, read_collection
+from ..devices import device_of
 from ..errors import InputError
 from ..field.avatar import Avatar
 from ..images import write_exr, write_rgba
@@ -70,13 +71,16 @@ def render_track(
     quality: str = "final",
     progress: Report | None = None,
     should_stop: Callable[[], bool] | None = None,
+    device: str = "cpu",
 ) -> list[Path]:
     """Renders and writes one picture a frame; returns their paths.
 
     appearance: a name, or "all" with {appearance} in `out`. The collection's own identity poses
     the mesh. Raises InputError before anything is written.
     """
+    where = device_of(device)
     avatar = Avatar.load(avatar_path)
+    avatar.field.to(where)
     collection, clip = parse_track(track)
     check_head(avatar, collection)
     names = avatar.appearances if appearance == "all" else [appearance]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -33,6 +33,10 @@ class Pixels:
     depth: torch.Tensor
     frames: list[Frame]
     starts: list[int]
+
+    def to(self, device: torch.device) -> Pixels:
+        names = ("rays", "frame", "colour", "alpha", "depth")
+        return replace(self, **{name: getattr(self, name).to(device) for name in names})
 
 
 @dataclass(eq=False)

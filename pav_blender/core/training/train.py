@@ -7,6 +7,8 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import torch
+
 from ..collection import Collection, read_collection
 from ..config import Config
 from ..errors import Cancelled, InputError
@@ -30,6 +32,7 @@ def train(
     progress: Report | None = None,
     loading: Report | None = None,
     should_stop: Callable[[], bool] | None = None,
+    device: torch.device | str = "cpu",
 ) -> Avatar:
     """Trains an avatar on the "train" frames of a collection and writes it to `out`.
 
@@ -49,7 +52,8 @@ def train(
         raise InputError(f"{saved}: no checkpoint to resume from")
     frames = load_training_frames(collection, loading)
     source = fingerprint(collection)
-    trainer = Trainer(new_avatar(collection, frames, config or Config()), frames, minutes=minutes)
+    avatar = new_avatar(collection, frames, config or Config())
+    trainer = Trainer(avatar, frames, minutes=minutes, device=device)
     if resume:
         load_checkpoint(saved, trainer, source)
     last_saved = time.monotonic()
@@ -70,7 +74,7 @@ def train(
             last_saved = time.monotonic()
         if stopping:
             raise Cancelled(f"training was stopped; `--resume` goes on from {saved}")
-    avatar = trainer.avatar
+    avatar.field.cpu()
     avatar.record |= {
         "iterations": trainer.status.iteration,
         "seconds": round(trainer.status.seconds, 1),

@@ -22,6 +22,7 @@ from .occupancy import Visibility
 _FIRST_STEP = 8.0  # the first samples are this many times as far apart as the last
 _LOOKS_A_RAY = 40  # the step is as fine as this many looks a ray allow
 _SAMPLES = 1 << 14  # samples a batch, by the number of its rays
+_MANY_SAMPLES = 1 << 18  # the same off the CPU, where few take as long as many
 _CARVED = 0.5  # part of the schedule in which space is emptied often
 _PRUNE_EVERY = 50  # iterations, while there is much to empty
 _PRUNE_LATER = 200
@@ -52,9 +53,15 @@ class Trainer:
     """Holds what changes while an avatar learns. `minutes` plans the schedule by the clock."""
 
     def __init__(
-        self, avatar: Avatar, frames: list[Frame], *, minutes: float | None = None
+        self,
+        avatar: Avatar,
+        frames: list[Frame],
+        *,
+        minutes: float | None = None,
+        device: torch.device | str = "cpu",
     ) -> None:
         self.avatar = avatar
+        self.device = torch.device(device)
         self.minutes = minutes
         self.config: Config = avatar.config
         self.status = Status(step=_FIRST_STEP * self.config.step, rays=self.config.rays // 8)
@@ -67,6 +74,7 @@ class Trainer:
         for _ in _COARSE:
             frames = [halved(frame) for frame in frames]
             self._pyramid.append(_by_appearance(frames, len(avatar.appearances)))
+        avatar.field.to(self.device)
         self.moments = {
             name: (torch.zeros_like(p), torch.zeros_like(p))
             for name, p in avatar.field.named_parameters()
@@ -94,21 +102,23 @@ class Trainer:
             picked = pick_samples(
                 self._poses, pixels, self.visibility, config, status.step, self.generator
             )
-            encoded = field.encode(picked.samples)
-        ops = kernels.select("cpu")
-        sigma, rgb = field(picked.samples, encoded=encoded.requires_grad_())
-        colour, opacity, depth, weights = ops.marching.composite(
-            sigma, rgb, picked.t, picked.width, picked.samples.ray, count
+            samples = picked.samples.to(self.device)
+            encoded = field.encode(samples)
+        pixels, t = pixels.to(self.device), picked.t.to(self.device)
+        sigma, rgb = field(samples, encoded=encoded.requires_grad_())
+        colour, opacity, depth, weights = kernels.select(self.device).marching.composite(
+            sigma, rgb, t, picked.width.to(self.device), samples.ray, count
         )
-        background = torch.rand(count, 3, generator=self.generator)
+        background = torch.rand(count, 3, generator=self.generator).to(self.device)
         # what lies behind where a ray was ended by mistake must not be laid to what is before it
-        counted = ~picked.ended | (opacity.detach() > 1 - _ENDED)
+        counted = ~picked.ended.to(self.device) | (opacity.detach() > 1 - _ENDED)
         loss = losses(config, pixels, background, colour, opacity, depth, counted)
         if torch.isfinite(loss.total):
-            spread = distortion(weights, picked.t, picked.samples.ray, count)
+            spread = distortion(weights, t, samples.ray, count)
             (loss.total + config.distortion_weight * spread).backward()
-            self._adam(picked.samples, encoded)
-            self.visibility.watch(picked.cells, sigma.detach(), weights.detach(), picked.width)
+            self._adam(samples, encoded)
+            density, seen = sigma.detach().cpu(), weights.detach().cpu()
+            self.visibility.watch(picked.cells, density, seen, picked.width)
         status.iteration += 1
         if self._prunes_now():
             status.filled = self.visibility.prune()
@@ -137,7 +147,8 @@ class Trainer:
         status, config = self.status, self.config
         wanted = status.step / config.step * (max(looks, 1.0) / _LOOKS_A_RAY) ** 0.2
         status.step = config.step * min(max(wanted, 1.0), _FIRST_STEP)
-        rays = _SAMPLES / max(status.samples_per_ray, 1.0)
+        wanted = _SAMPLES if self.device.type == "cpu" else _MANY_SAMPLES
+        rays = wanted / max(status.samples_per_ray, 1.0)
         status.rays = int(min(max(rays, config.rays / 8), config.rays))
 
     def _prunes_now(self) -> bool:
@@ -147,7 +158,7 @@ class Trainer:
 
     def _adam(self, samples: Samples, encoded: torch.Tensor) -> None:
         config, field = self.config, self.avatar.field
-        ops = kernels.select("cpu")
+        ops = kernels.select(self.device)
         step = self.status.iteration + 1
         late = max(0.0, self.done - config.decay_from) / (1 - config.decay_from)
         decay = config.final_learning_rate**late * min(1.0, step / _WARM_UP)

@@ -86,6 +86,7 @@ def encode(points: Tensor, tables: Tensor, layout: Layout) -> Tensor:
     """
     check_encode(points, tables, layout)
     points = torch.nan_to_num(points, nan=0.0).clamp(0, 1)
+    steps = torch.tensor([(i & 1, i >> 1 & 1, i >> 2) for i in range(8)], device=points.device)
     parts = []
     for res, offset, size, hashed in zip(
         layout.resolutions, layout.offsets, layout.sizes, layout.hashed, strict=True
@@ -93,18 +94,14 @@ def encode(points: Tensor, tables: Tensor, layout: Layout) -> Tensor:
         position = points * res
         cell = position.detach().floor().clamp(max=res - 1)
         fraction = position - cell
-        corner = cell.long()
-        part = points.new_zeros(len(points), FEATURES)
-        for dx, dy, dz in ((i & 1, i >> 1 & 1, i >> 2) for i in range(8)):
-            step = corner.new_tensor((dx, dy, dz))
-            x, y, z = (corner + step).unbind(1)
-            if hashed:
-                index = (x * PRIMES[0] ^ y * PRIMES[1] ^ z * PRIMES[2]) & (size - 1)
-            else:
-                index = x + (res + 1) * (y + (res + 1) * z)
-            weight = torch.where(step.bool(), fraction, 1 - fraction).prod(1, keepdim=True)
-            part = part + weight * tables[offset + index]
-        parts.append(part)
+        x, y, z = (cell.long()[:, None] + steps).unbind(2)  # [N, 8]
+        if hashed:
+            index = (x * PRIMES[0] ^ y * PRIMES[1] ^ z * PRIMES[2]) & (size - 1)
+        else:
+            index = x + (res + 1) * (y + (res + 1) * z)
+        share = fraction[:, None]
+        weight = torch.where(steps.bool(), share, 1 - share).prod(2, keepdim=True)
+        parts.append((weight * tables[offset + index]).sum(1))
     return torch.cat(parts, 1)
 
 
