@@ -75,6 +75,12 @@ class Worn:
     code: torch.Tensor
 
 
+def _normal(values: torch.Tensor, deviation: float) -> torch.Tensor:
+    """Fills with normal noise, in place; but what has no values stays as it is, since torch would
+    load its compiler for that: a second before an avatar's first picture."""
+    return values if values.is_meta else nn.init.normal_(values, 0, deviation)
+
+
 class Mlp(nn.Module):
     """Weights of a ReLU network whose first layer also sees inputs constant over a group."""
 
@@ -151,12 +157,12 @@ class Field(nn.Module):
             "global": (appearances, config.global_channels),
             "none": (appearances, 0),
         }[config.appearance]
-        self.latent = nn.Parameter(torch.randn(shape) * 0.1)
+        self.latent = nn.Parameter(_normal(torch.empty(shape), 0.1))
         # what an appearance's features have in common: every sample teaches it, so that
         # appearances part company long before each vertex was seen often
         mapped = config.appearance in ("vertex", "surface")
         codes = config.latent_channels if config.appearance_code and mapped else 0
-        self.code = nn.Parameter(torch.randn(appearances, codes) * 0.5)
+        self.code = nn.Parameter(_normal(torch.empty(appearances, codes), 0.5))
         embedding, geometry = config.embedding_channels, config.geometry_channels
         conditions = config.sees_expression * expressions + config.sees_turn * TURN
         self.density = Mlp(
@@ -167,7 +173,7 @@ class Field(nn.Module):
             seen = geometry - 1 if config.offset_sees_geometry else 0
             self.offset = Mlp(embedding + seen, conditions, config.hidden, config.offset_layers, 1)
             # starts as next to no offset: the shared density comes first
-            nn.init.normal_(self.offset.weights[-1], 0, 1e-2)
+            _normal(self.offset.weights[-1], 1e-2)
         self.colour = Mlp(
             geometry + embedding, directions.CHANNELS, config.hidden, config.colour_layers, 3
         )
