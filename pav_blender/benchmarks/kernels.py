@@ -1,7 +1,7 @@
 """Each compiled kernel: nanoseconds a sample, against a floor from this machine's own rates.
 
 A floor is what the kernel must move or compute at least, at the rates that plain large operations
-reach here: multiply-adds of a matrix product, bytes of a copy.
+reach here: multiply-adds of a matrix product, bytes of a copy, exponentials of a vector.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ _SIDE = 1024  # of the matrices that tell the rate of multiply-adds
 _CACHE = 1 << 20  # bytes a core keeps to itself
 _LINES = 4  # cache lines that the eight corners of a cell lie in
 _COPY = 1 << 25  # floats that tell the rate of memory
+_TILE = 0.004  # metres
 _SEARCH_FLOPS = 1200  # of one search that opens one node a level and measures one leaf
 
 
@@ -58,20 +59,23 @@ def run(options: Options, progress: Report | None = None) -> tuple[dict[str, Any
 
 
 def _rates(repeats: int) -> dict[str, float]:
-    """Multiply-adds and bytes a nanosecond, all cores together."""
+    """Multiply-adds, bytes and exponentials a nanosecond, all cores together."""
     a, b = torch.rand(2, _SIDE, _SIDE)
+    few = torch.rand(_N, dtype=torch.float64)
     source, target = torch.rand(_COPY), torch.empty(_COPY)
     with torch.inference_mode():
         seconds = best(
             {
                 "product": lambda: a @ b,
                 "copy": lambda: target.copy_(source),
+                "exponential": lambda: torch.exp(few),
             },
             repeats + 2,
         )
     return {
         "multiply_adds_per_ns": round(_SIDE**3 / seconds["product"] * 1e-9, 2),
         "bytes_per_ns": round(8 * _COPY / seconds["copy"] * 1e-9, 2),
+        "exponentials_per_ns": round(_N / seconds["exponential"] * 1e-9, 2),
     }
 
 
@@ -90,7 +94,8 @@ def _kernels(
     vertices = torch.from_numpy(frame.vertices)
     mesh = deformer_of(avatar).pose(frame.vertices)
     near = vertices[torch.arange(_N) // 16 % len(vertices)]
-    near = near + torch.rand(_N, 3, generator=generator) * 0.01
+    # sixteen neighbours, as a picture's tile asks for
+    near = near + torch.rand(_N, 3, generator=generator) * _TILE
     ray = torch.arange(_N // 8, dtype=torch.int32).repeat_interleave(8)
     sigma, colour = torch.rand(_N, generator=generator) * 100, torch.rand(_N, 3)
     t = torch.rand(_N)
@@ -126,7 +131,11 @@ def _kernels(
         "hash encoding": (_N, _LINES * 64 * large / byte, "cache lines of its large levels"),
         "density network, forward": (_N, multiplies / fma, "multiply-adds"),
         "density network, forward and backward": (_N, 3 * multiplies / fma, "multiply-adds"),
-        "compositing": (_N, 4 * (5 + 1) / byte, "bytes in and out"),
+        "compositing": (
+            _N,
+            4 * (5 + 1) / byte + 1 / rates["exponentials_per_ns"],
+            "bytes in and out, an exponential",
+        ),
         "Adam": (len(table), 4 * 7 / byte, "bytes in and out"),
     }
     return calls, floors

@@ -35,6 +35,10 @@ _PER_APPEARANCE = 4
 def run(options: Options, progress: Report | None = None) -> tuple[dict[str, Any], list[Claim]]:
     collection = collection_of(options)
     frames = load_training_frames(collection)
+    # kernels are compiled, or read from the disk, before any clock runs
+    warm = Trainer(new_avatar(collection, frames, Config()), frames)
+    for _ in range(3):
+        warm.iterate()
     points = []
     trainer = None
     for part in _BUDGETS:

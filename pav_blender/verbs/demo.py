@@ -30,7 +30,7 @@ SECONDS = 600.0
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, default=Path("out/demo"), help="folder of the results")
-    parser.add_argument("--minutes", type=float, default=7.5, help="training time")
+    parser.add_argument("--minutes", type=float, default=8.25, help="training time")
     parser.add_argument("--frames", type=int, default=24, help="pictures an appearance")
     parser.add_argument("--held-out", type=int, default=4, help="held-out frames an appearance")
     parser.add_argument("--collection", type=Path, help="train on this one instead")

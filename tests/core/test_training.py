@@ -15,6 +15,7 @@ from pav_blender.core.evaluation.heldout import held_out, score
 from pav_blender.core.evaluation.report import figures, measure
 from pav_blender.core.field.avatar import Avatar
 from pav_blender.core.rendering.render import RenderSettings, pose_scene
+from pav_blender.core.training.attention import Attention
 from pav_blender.core.training.batches import draw_pixels, pick_samples
 from pav_blender.core.training.checkpoint import checkpoint_path
 from pav_blender.core.training.frames import halved
@@ -43,6 +44,28 @@ def test_depth_targets_are_the_tracked_face_and_nothing_else(frames, toy):
     rows = np.argwhere(target)
     assert (rows.min(0) + 1 >= np.floor(pixels.min(0))[::-1]).all()
     assert (rows.max(0) - 1 <= np.ceil(pixels.max(0))[::-1]).all()
+
+
+def test_rays_are_led_to_where_they_were_wrong(frames):
+    frame, random, attention = frames[3], np.random.default_rng(0), Attention()
+    assert len(np.unique(attention.draw(frame, 4000, random))) > 0.95 * len(frame.tiles)
+    wrong = len(frame.tiles) // 2
+    tile = np.arange(len(frame.tiles)).repeat(16)
+    squared = np.where(tile == wrong, 1.0, 1e-5)
+    attention.note([frame], [0], tile, squared)
+    assert (attention.draw(frame, 1000, random) == wrong).mean() > 0.9
+    pixels = draw_pixels([frame], 4096, random, attention)
+    assert 0.35 < (pixels.tile == wrong).mean() < 0.5
+    assert len(np.unique(pixels.tile)) > 50  # nothing starves
+    columns, rows = frame.camera.project(
+        (pixels.rays.origins + pixels.rays.directions).numpy().astype(float)
+    )[0].T
+    there = pixels.tile == wrong
+    assert (np.floor(rows[there] / 4) == frame.tiles[wrong][0]).all()
+    assert (np.floor(columns[there] / 4) == frame.tiles[wrong][1]).all()
+    again = Attention()
+    again.restore(attention.state())
+    np.testing.assert_array_equal(again.of(frame), attention.of(frame))
 
 
 def test_the_hull_holds_the_surface_and_leaves_out_what_no_matte_shows(toy, frames, small_config):

@@ -14,23 +14,27 @@ from ..deformation import Clearance, Deformer, PosedMesh, Thrift, Voxels, voxels
 from ..deformation.rigid import Stance, stance
 from ..field.field import Samples, condition
 from ..rendering.rays import TILE, Packed, RayBatch, camera_rays, pack, still_of
+from .attention import Attention
 from .frames import Frame
 from .occupancy import Visibility
 
 _UNIFORM = 0.05  # part of the tiles drawn from anywhere in the picture
+_LED = 0.4  # part of the tiles drawn by how wrong they were
 _KEPT_POSES = 512
 _THRIFT = Thrift(width=48, share=0.05, longest=3, opaque=8.0)
 
 
 @dataclass(eq=False)
 class Pixels:
-    """R pixels of B frames: colour [R, 3] and alpha [R] in [0, 1], depth [R] (0: no target)."""
+    """R pixels of B frames: colour [R, 3] and alpha [R] in [0, 1], depth [R] (0: no target); tile
+    [R], the row in its frame's tiles, or -1."""
 
     rays: RayBatch
     frame: torch.Tensor
     colour: torch.Tensor
     alpha: torch.Tensor
     depth: torch.Tensor
+    tile: np.ndarray
     frames: list[Frame]
     starts: list[int]
 
@@ -87,13 +91,20 @@ class Poses:
         return known
 
 
-def draw_pixels(frames: list[Frame], rays: int, random: np.random.Generator) -> Pixels:
+def draw_pixels(
+    frames: list[Frame],
+    rays: int,
+    random: np.random.Generator,
+    attention: Attention | None = None,
+) -> Pixels:
     """Tiles of pixels, mostly near the matte, an equal number from each frame."""
     per_frame = max(1, rays // len(frames) // TILE**2)
     parts: list[tuple[RayBatch, np.ndarray, np.ndarray]] = []
+    tiles = []
     starts, total = [], 0
     for frame in frames:
-        columns, rows = _draw_tiles(frame, per_frame, random)
+        columns, rows, tile = _draw_tiles(frame, per_frame, random, attention)
+        tiles.append(tile)
         starts.append(total)
         total += len(columns)
         parts.append(
@@ -116,25 +127,31 @@ def draw_pixels(frames: list[Frame], rays: int, random: np.random.Generator) -> 
         rgba[:, :3],
         rgba[:, 3],
         torch.from_numpy(np.concatenate([p[2] for p in parts]).astype(np.float32)),
+        np.concatenate(tiles),
         frames,
         starts,
     )
 
 
 def _draw_tiles(
-    frame: Frame, count: int, random: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
+    frame: Frame, count: int, random: np.random.Generator, attention: Attention | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Columns and rows of pixels, and each one's row in the frame's tiles or -1."""
     height, width = frame.rgba.shape[:2]
     anywhere = round(count * _UNIFORM)
-    chosen = frame.tiles[random.integers(len(frame.tiles), size=count - anywhere)]
+    led = 0 if attention is None else round(count * _LED)
+    which = random.integers(len(frame.tiles), size=count - anywhere - led)
+    if attention is not None and led:
+        which = np.concatenate([which, attention.draw(frame, led, random)])
     limit = (-(-height // TILE), -(-width // TILE))
     free = random.integers((0, 0), limit, size=(anywhere, 2))
-    corner = np.concatenate([chosen, free]).astype(np.int64) * TILE
+    corner = np.concatenate([frame.tiles[which], free]).astype(np.int64) * TILE
     inner = np.arange(TILE)
     rows = (corner[:, 0, None, None] + inner[:, None]).repeat(TILE, 2).reshape(-1)
     columns = (corner[:, 1, None, None] + inner[None, :]).repeat(TILE, 1).reshape(-1)
+    tile = np.concatenate([which, np.full(anywhere, -1)]).repeat(TILE**2)
     inside = (rows < height) & (columns < width)
-    return columns[inside], rows[inside]
+    return columns[inside], rows[inside], tile[inside]
 
 
 def pick_samples(

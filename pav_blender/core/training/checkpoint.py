@@ -30,6 +30,7 @@ def save_checkpoint(path: Path, trainer: Trainer, source: str) -> None:
     for name, (m, v) in trainer.moments.items():
         tensors[f"m.{name}"], tensors[f"v.{name}"] = m, v
     tensors |= {f"seen.{name}": value for name, value in trainer.visibility.state().items()}
+    tensors |= {f"drawn.{name}": value for name, value in trainer.attention.state().items()}
     tensors["generator"] = trainer.generator.get_state()
     header = {
         "format": FORMAT,
@@ -70,6 +71,9 @@ def load_checkpoint(path: Path, trainer: Trainer, source: str) -> None:
             v.copy_(tensors[f"v.{name}"])
         trainer.visibility.restore(
             {name[5:]: value for name, value in tensors.items() if name.startswith("seen.")}
+        )
+        trainer.attention.restore(
+            {name[6:]: value for name, value in tensors.items() if name.startswith("drawn.")}
         )
         trainer.generator.set_state(tensors["generator"])
         trainer.random.bit_generator.state = header["random"]

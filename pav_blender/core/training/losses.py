@@ -12,11 +12,12 @@ from .batches import Pixels
 
 @dataclass(frozen=True)
 class Loss:
-    """total is what is minimised; mse is the plain colour error."""
+    """total is what is minimised; mse is the plain colour error, squared [R, 3] each ray's."""
 
     total: torch.Tensor
     mse: float
     depth: float
+    squared: torch.Tensor
 
 
 def losses(
@@ -42,7 +43,7 @@ def losses(
     face = (pixels.depth > 0) & counted
     gap = torch.where(face, (depth * pixels.rays.cosine - pixels.depth).abs(), 0.0).mean()
     total = config.colour_weight * mse + config.depth_weight * gap
-    return Loss(total, float(mse.detach()), float(gap.detach()))
+    return Loss(total, float(mse.detach()), float(gap.detach()), squared.detach())
 
 
 def distortion(

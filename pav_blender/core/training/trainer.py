@@ -14,6 +14,7 @@ from ..config import Config
 from ..deformation import Deformer
 from ..field.avatar import Avatar
 from ..field.field import Samples
+from .attention import Attention
 from .batches import Poses, draw_pixels, pick_samples
 from .frames import Frame, halved
 from .losses import Loss, distortion, losses
@@ -70,6 +71,7 @@ class Trainer:
         deformer = Deformer(avatar.canonical_vertices, avatar.triangles, self.config.frames)
         self.visibility = Visibility(avatar, deformer)
         self._poses = Poses(deformer, avatar.canonical_vertices, avatar.rigid_weights)
+        self.attention = Attention()
         self._pyramid = [_by_appearance(frames, len(avatar.appearances))]
         for _ in _COARSE:
             frames = [halved(frame) for frame in frames]
@@ -96,7 +98,7 @@ class Trainer:
         """One iteration: batch, loss, backward, Adam; the occupancy now and then."""
         started = time.monotonic()
         config, status, field = self.config, self.status, self.avatar.field
-        pixels = draw_pixels(self._choose_frames(), status.rays, self.random)
+        pixels = draw_pixels(self._choose_frames(), status.rays, self.random, self.attention)
         count = len(pixels.rays)
         with torch.no_grad():
             picked = pick_samples(
@@ -117,6 +119,8 @@ class Trainer:
             spread = distortion(weights, t, samples.ray, count)
             (loss.total + config.distortion_weight * spread).backward()
             self._adam(samples, encoded)
+            squared = loss.squared.mean(1).cpu().numpy()
+            self.attention.note(pixels.frames, pixels.starts, pixels.tile, squared)
             density, seen = sigma.detach().cpu(), weights.detach().cpu()
             self.visibility.watch(picked.cells, density, seen, picked.width)
         status.iteration += 1

@@ -38,9 +38,10 @@ def _weigh(start, stop, offsets, sigma, delta, transmittance, weights):
     for ray in range(start, stop):
         left = np.float64(transmittance[ray])
         for i in range(offsets[ray], offsets[ray + 1]):
-            optical = np.float64(sigma[i]) * delta[0 if one_delta else i]
-            weights[i] = -left * np.expm1(-optical)
-            left *= np.exp(-optical)
+            # in double precision 1 - exp is as good as expm1, at half the price
+            passes = np.exp(-np.float64(sigma[i]) * delta[0 if one_delta else i])
+            weights[i] = left * (1.0 - passes)
+            left *= passes
         transmittance[ray] = left
 
 
