@@ -14,7 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from ..core.collection import Collection
 from ..core.errors import PavError
+from ..core.evaluation.heldout import chosen_frames
 from ..core.evaluation.metrics import over, psnr
 from ..core.evaluation.report import Claim
 from ..core.field.avatar import Avatar
@@ -50,8 +52,10 @@ def run(options: Options, progress: Report | None = None) -> tuple[dict[str, Any
         points += _timed(avatar, frame, size, truth, _variants(size), options.repeats)
         if size == _DETAILED:
             skips = _skips(avatar, frame, size, truth, options.repeats)
+    looks = _looks(avatar, collection)
     show(points)
     show(skips)
+    show(looks)
     agreement = _against_plain(avatar, frame, exact[frame.camera.width])
     print(f"reference preset against plain torch, {_PLAIN_PIXELS} pixels: {agreement:.1f} dB")
     cold = {name: _cold_start(options.out / "subject.pav", name == "cached") for name in _CACHES}
@@ -68,6 +72,7 @@ def run(options: Options, progress: Report | None = None) -> tuple[dict[str, Any
     fields = {
         "points": points,
         "skips": skips,
+        "looks": looks,
         "plain_torch_psnr": round(agreement, 2),
         "cold_start_seconds": cold,
         "cycles_seconds": cycles,
@@ -147,6 +152,24 @@ def _skips(
     for name, change in SKIPS.items():
         variants[f"without: {name}"] = dataclasses.replace(_FINAL, **change)  # type: ignore[arg-type]
     return _timed(avatar, frame, size, truth, variants, repeats)
+
+
+def _looks(avatar: Avatar, collection: Collection) -> list[dict[str, Any]]:
+    """The final preset for every appearance in a held-out pose of its own, and in one of another's,
+    which no frame has shown it in."""
+    frames = chosen_frames(collection, ("test",), None)
+    rows = []
+    for row, name in enumerate(avatar.appearances):
+        own = [f for f in frames if f.appearance == row]
+        others = [f for f in frames if f.appearance == (row + 1) % len(avatar.appearances)]
+        for motion, frame in (("own", own[len(own) // 2]), ("another's", others[1])):
+            worn = dataclasses.replace(frame, appearance=row)
+            truth = _picture(avatar, worn, _DETAILED, RenderSettings.preset("reference"))
+            point = _point(avatar, worn, _DETAILED, _FINAL, truth, name)
+            rows.append({"appearance": name, "motion": motion} | point)
+    for point in rows:
+        del point["seconds"], point["name"]
+    return rows
 
 
 def _against_plain(avatar: Avatar, frame: Frame, exact: Picture) -> float:

@@ -19,6 +19,7 @@ from .occupancy import clearance
 
 _VOXEL = 0.003  # metres
 _STRETCH = 1.4  # of the map from posed to canonical space that is allowed for
+_BESIDE = 1.2  # times the margin of a cube: what is beside it may be torn from it
 _SIDES = (16, 8, 4)  # in voxels, of the cubes that are looked at one after the other
 
 
@@ -36,11 +37,9 @@ def voxels(mesh: PosedMesh, space: Clearance, reach: float) -> Voxels:
         if size < _SIDES[0]:
             places = (2 * places[:, None] + children).view(-1, 3)
         middles = low + (places + 0.5) * (size * _VOXEL)
-        kept, found = _filled(mesh, space, reach, middles, size * _VOXEL)
+        kept, found = _near_filled(mesh, space, reach, middles, size * _VOXEL)
         places = places[kept]
-    # within a brick the map is as good as affine
-    maps = _linear(mesh, found.triangle, found.barycentric)
-    cells = kernels.select("cpu").picking.brick_cells(found.canonical, maps, space, _VOXEL)
+    cells = _brick_cells(mesh, space, places, found)
     held = (cells >= 0).any(1)
     places, cells = places[held], cells[held]
     corner = places.amin(0) if len(places) else torch.zeros(3, dtype=torch.int32)
@@ -55,25 +54,48 @@ def voxels(mesh: PosedMesh, space: Clearance, reach: float) -> Voxels:
 
 
 class _Found(NamedTuple):
-    """Where posed points lie on the mesh and in canonical space."""
+    """Where posed points lie on the mesh and in canonical space, and how many cells off the nearest
+    occupied one is."""
 
     triangle: torch.Tensor
     barycentric: torch.Tensor
     canonical: torch.Tensor
+    clear: torch.Tensor
 
 
-def _filled(
+def _near_filled(
     mesh: PosedMesh, space: Clearance, reach: float, middles: torch.Tensor, side: float
 ) -> tuple[torch.Tensor, _Found]:
-    """Which cubes [N], by their middles [N, 3] and side, may hold something, and where the middles
-    of those lie."""
+    """Which cubes [N], by their middles [N, 3] and side, may hold something or are beside such, and
+    where the middles of those lie."""
     ops = kernels.select("cpu")
     triangle, barycentric, distance = ops.nearest.nearest(mesh.search, middles)
     canonical = ops.marching.canonicalise(middles, triangle, barycentric, mesh)
     half = 0.87 * side
     clear = cells_from_occupied(canonical, space)
-    kept = (distance <= reach + half) & (clear <= np.ceil(half * _STRETCH / space.cell))
-    return kept, _Found(triangle[kept], barycentric[kept], canonical[kept])
+    kept = (distance <= reach + half) & (clear <= np.ceil(_BESIDE * half * _STRETCH / space.cell))
+    return kept, _Found(triangle[kept], barycentric[kept], canonical[kept], clear[kept])
+
+
+def _brick_cells(
+    mesh: PosedMesh, space: Clearance, places: torch.Tensor, found: _Found
+) -> torch.Tensor:
+    """Canonical cells [N, 64] of bricks at places [N, 3]. Within a brick the map is as good as
+    affine, but for bricks in which the nearest point leaps from one part of the mesh to another:
+    their voxels may lie where a neighbour's map takes them as well."""
+    ops = kernels.select("cpu").picking
+    maps = _linear(mesh, found.triangle, found.barycentric)
+    margin = int(np.ceil(0.87 * BRICK * _VOXEL * _STRETCH / space.cell))
+    cells = torch.full((len(places), BRICK**3), -1, dtype=torch.int32)
+    own = (found.clear <= margin).nonzero()[:, 0]
+    cells[own] = ops.brick_cells(found.canonical[own], maps[own], space, _VOXEL)
+    if len(places):
+        corner = places.amin(0) - 1
+        at = torch.full(tuple((places.amax(0) - corner + 2).tolist()), -1, dtype=torch.int32)
+        where = places - corner
+        at[where.long().unbind(1)] = torch.arange(len(places), dtype=torch.int32)
+        ops.add_torn(cells, at, where, found.canonical, maps, space, _VOXEL, margin)
+    return cells
 
 
 def _linear(mesh: PosedMesh, triangle: torch.Tensor, barycentric: torch.Tensor) -> torch.Tensor:

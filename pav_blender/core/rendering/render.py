@@ -39,7 +39,7 @@ class RenderSettings:
     between two looks at its transmittance; chunk: rays that a thread takes at a time.
     """
 
-    step: float = 1.25e-3
+    step: float = 1e-3
     transmittance: float = 5e-3
     skip: bool = True
     share: float = 0.02
@@ -55,7 +55,12 @@ class RenderSettings:
         """ "preview" (fast), "final", "reference" (every sample, to the end of the ray)."""
         presets = {
             "preview": cls(
-                step=2.5e-3, transmittance=2e-2, share=0.05, tolerance=0.4, negligible=1.0
+                step=2.5e-3,
+                probe=2,
+                tolerance=0.4,
+                share=0.05,
+                transmittance=2e-2,
+                negligible=1.0,
             ),
             "final": cls(),
             "reference": cls(step=3.9e-4, transmittance=0.0, skip=False, negligible=0.0, wave=64),

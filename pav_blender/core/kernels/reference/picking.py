@@ -17,6 +17,7 @@ from .marching import canonicalise, occupied
 from .nearest import nearest
 
 BRICK = 4  # voxels a side
+TORN = 0.004  # metres between where two bricks' maps take a place, from which they are torn
 LEAST = 1e-4  # density (1/m) that the guide calls empty
 RISE, FALL = 0.15, 0.5  # parts of the way that one sample moves the guide
 GOLDEN = 0.6180339887
@@ -184,6 +185,40 @@ def brick_cells(
     around = canonical[:, None] + offsets @ maps.mT
     cells, clear = _in_grid(around.view(-1, 3), space)
     return torch.where(clear <= 1, cells, -1).int().view(-1, BRICK**3)
+
+
+def add_torn(
+    cells: torch.Tensor,
+    at: torch.Tensor,
+    places: torch.Tensor,
+    canonical: torch.Tensor,
+    maps: torch.Tensor,
+    space: Clearance,
+    voxel: float,
+    margin: int,
+) -> None:
+    """Where the nearest point leaps from one part of a mesh to another between two bricks, the
+    map of each may hold in part of the other: cells [N, 64] are set, in place, where they have
+    none, to what the maps of torn neighbours say.
+
+    at: rows of bricks in a grid with a free border, -1 where there is none; places [N, 3]: where
+    each is in it; canonical, maps, voxel as in `brick_cells`; margin: cells from an occupied one
+    beyond which nothing in a brick can be.
+    """
+    side = BRICK * voxel
+    for axis in range(3):
+        for sign in (1, -1):
+            step = torch.zeros(3, dtype=places.dtype, device=places.device)
+            step[axis] = sign
+            beside = at[(places + step).long().unbind(1)].long()
+            bricks = (beside >= 0).nonzero()[:, 0]
+            beside = beside[bricks]
+            there = canonical[beside] - sign * side * maps[beside, :, axis]
+            torn = (there - canonical[bricks]).abs().amax(1) > TORN
+            torn &= cells_from_occupied(there, space) <= margin
+            bricks, beside, there = bricks[torn], beside[torn], there[torn]
+            found = brick_cells(there, maps[beside], space, voxel)
+            cells[bricks] = torch.where(cells[bricks] < 0, found, cells[bricks])
 
 
 def follow(guide: torch.Tensor, cells: torch.Tensor, density: torch.Tensor) -> None:
