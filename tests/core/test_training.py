@@ -68,6 +68,26 @@ def test_rays_are_led_to_where_they_were_wrong(frames):
     np.testing.assert_array_equal(again.of(frame), attention.of(frame))
 
 
+def test_of_long_clips_some_frames_are_in_use_and_others_follow(
+    toy, frames, small_config, monkeypatch
+):
+    """To pose a frame takes as long as to learn from it."""
+    from pav_blender.core.training import trainer as module
+
+    monkeypatch.setattr(module, "KEPT_POSES", 4)
+    trainer = Trainer(new_avatar(toy, frames, small_config), frames)
+    drawn = [[f.name for f in trainer._choose_frames()] for _ in range(400)]
+    for batch in drawn:
+        assert len({name.split("/")[0] for name in batch}) == 2  # every appearance, every time
+    names = [name for batch in drawn for name in batch]
+    assert {f.name for f in frames} == set(names)  # each is used some time
+    fresh, recent = 0, []
+    for name in names:
+        fresh += name not in recent
+        recent = [*recent, name][-40:]
+    assert fresh < 0.2 * len(names)
+
+
 def test_the_hull_holds_the_surface_and_leaves_out_what_no_matte_shows(toy, frames, small_config):
     """The second appearance's scalp stands out: its hull must hold it, the first's need not."""
     avatar = new_avatar(toy, frames, small_config)

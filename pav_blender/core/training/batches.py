@@ -20,7 +20,7 @@ from .occupancy import Visibility
 
 _UNIFORM = 0.05  # part of the tiles drawn from anywhere in the picture
 _LED = 0.4  # part of the tiles drawn by how wrong they were
-_KEPT_POSES = 512
+KEPT_POSES = 192  # some six megabytes each
 _THRIFT = Thrift(width=48, share=0.05, longest=3, opaque=8.0)
 
 
@@ -83,7 +83,7 @@ class Poses:
             meshes = self._canonical, frame.vertices, self._weights
             known = _Posed(mesh, stance(*meshes), voxels(mesh, space, reach), version)
             self._kept[frame.name] = known
-            if len(self._kept) > _KEPT_POSES:
+            if len(self._kept) > KEPT_POSES:
                 self._kept.popitem(last=False)
         elif known.version != version:
             known.voxels, known.version = voxels(known.mesh, space, reach), version

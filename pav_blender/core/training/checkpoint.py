@@ -38,6 +38,7 @@ def save_checkpoint(path: Path, trainer: Trainer, source: str) -> None:
         "config": trainer.config.to_json(),
         "minutes": trainer.minutes,
         "status": dataclasses.asdict(trainer.status),
+        "pools": [[group, pool] for group, pool in trainer.pools.items()],
         "random": trainer.random.bit_generator.state,
     }
     with replacing(path) as temporary:
@@ -77,6 +78,7 @@ def load_checkpoint(path: Path, trainer: Trainer, source: str) -> None:
         )
         trainer.generator.set_state(tensors["generator"])
         trainer.random.bit_generator.state = header["random"]
+        trainer.pools = {int(group): list(pool) for group, pool in header["pools"]}
         trainer.status = Status(**header["status"])
     except (KeyError, RuntimeError, ValueError, TypeError) as error:
         raise InputError(f"{path}: does not fit this training; remove it to begin anew") from error

@@ -15,7 +15,7 @@ from ..deformation import Deformer
 from ..field.avatar import Avatar
 from ..field.field import Samples
 from .attention import Attention
-from .batches import Poses, draw_pixels, pick_samples
+from .batches import KEPT_POSES, Poses, draw_pixels, pick_samples
 from .frames import Frame, halved
 from .losses import Loss, distortion, losses
 from .occupancy import Visibility
@@ -33,6 +33,7 @@ _WARM_UP = 20
 _COARSE = (0.4, 0.15)
 _ENDED = 0.01  # transmittance at which a ray may be ended
 _PRUNE_FROM = 0.15
+_RENEWED = 1 / 16  # chance that a frame drawn is one that was not in use
 
 
 @dataclass
@@ -85,6 +86,7 @@ class Trainer:
         for name, parameter in avatar.field.named_parameters():
             if name in ("tables", "still_tables"):
                 parameter.requires_grad_(False)
+        self.pools: dict[int, list[int]] = {}
         self._mse = math.nan
 
     @property
@@ -135,12 +137,25 @@ class Trainer:
         """Frames of a batch: appearances in turn, frames at random; small pictures come first."""
         groups = self._pyramid[sum(self.done < until for until in _COARSE)]
         offset = int(self.random.integers(len(groups)))
-        return [
-            group[self.random.integers(len(group))]
-            for group in (
-                groups[(offset + i) % len(groups)] for i in range(self.config.frames_per_batch)
-            )
-        ]
+        chosen = []
+        for i in range(self.config.frames_per_batch):
+            which = (offset + i) % len(groups)
+            chosen.append(groups[which][self._draw(which, len(groups[which]))])
+        return chosen
+
+    def _draw(self, group: int, count: int) -> int:
+        """A frame of `count`. Of a long clip only some are in use at a time, and new ones take
+        their place little by little: to pose a frame takes as long as to learn from it."""
+        size = max(1, KEPT_POSES // len(self._pyramid[0]))
+        if count <= size:
+            return int(self.random.integers(count))
+        pool = self.pools.setdefault(group, [])
+        if len(pool) < size:
+            pool += self.random.integers(count, size=size).tolist()
+        slot = int(self.random.integers(size))
+        if self.random.random() < _RENEWED:
+            pool[slot] = int(self.random.integers(count))
+        return pool[slot]
 
     def _plan(self, looks: float) -> None:
         """Sets the next batch's step and size from what the last one looked at, a ray.

@@ -376,18 +376,21 @@ def _trace(total, walked, space, frames, field, lengths_of, limits, outputs):
                 chosen[a], following[a] = _runs(
                     ray, first[ray], last[ray], rays, space, out_left[ray], lengths_of, begins[a],
                     lengths[a])  # fmt: skip
-            requests = _ask_middles(living, alive, runs, asked)
-            count = _find(0, requests, base, asked, 0, rays, surface, grid, frames, feet, packet,
-                          samples)  # fmt: skip
-            densities(0, count, field, mesh_corners, samples, work, inputs, sigma)
-            if tolerance < 1:
-                _mark(living, alive, base, runs, asked[2], sigma, step, out_left, tolerance,
-                      transmittance)  # fmt: skip
-                known, middles = requests, count
-                requests = _ask_rest(living, alive, runs, asked, known)
-                count = _find(known, requests, base, asked, middles, rays, surface, grid, frames,
+            count, known, requests = 0, 0, 0
+            for part in range(2):  # the middles of runs, then what lies beside them
+                if part == 0:
+                    requests = _ask_middles(living, alive, runs, asked)
+                elif tolerance < 1:
+                    _mark(living, alive, base, runs, asked[2], sigma, step, out_left, tolerance,
+                          transmittance)  # fmt: skip
+                    known = requests
+                    requests = _ask_rest(living, alive, runs, asked, known)
+                else:
+                    break
+                begin = count
+                count = _find(known, requests, base, asked, begin, rays, surface, grid, frames,
                               feet, packet, samples)  # fmt: skip
-                densities(middles, count, field, mesh_corners, samples, work, inputs, sigma)
+                densities(begin, count, field, mesh_corners, samples, work, inputs, sigma)
             evaluations += count
             showing, going_on = 0, 0
             for a in range(living):
