@@ -20,6 +20,9 @@ from .mlp import BLOCK, HIDDEN, OUT, OUT_PAD, pack, through_layers, workspace
 from .search import INLINE
 
 HARMONICS = 16
+# rows of a sample's places: canonical in the unit box, resting with the shoulders, barycentrics,
+# distance from the mesh
+RESTING, WEIGHTS, DISTANCE, PLACES = 3, 6, 9, 10
 ROOM = corners.BLOCK  # samples past the last that a block may touch
 
 
@@ -64,21 +67,9 @@ def columns_of(field):
 
 
 @njit(**INLINE)
-def room_for(field, most):
-    """What `densities` works in: features, corners, rows of the latent, the networks' layers."""
-    networks = field[1]
-    return (
-        np.zeros((networks[0][0][0, 0] + 1, most + ROOM), np.float32),
-        (
-            np.zeros(3 * corners.BLOCK, np.float32),
-            np.zeros(8 * corners.STRIDE, np.int32),
-            np.zeros(8 * corners.STRIDE, np.float32),
-        ),
-        np.zeros(4 * rows.STRIDE, np.int64),
-        np.zeros(4 * rows.STRIDE, np.float32),
-        workspace(networks[0][0]),
-        workspace(networks[1][0]),
-    )
+def features_for(field, most):
+    """Where `densities` puts encoded places, a row a feature."""
+    return np.zeros((field[1][0][0][0, 0] + 1, most + ROOM), np.float32)
 
 
 @njit(**INLINE)
@@ -128,8 +119,9 @@ def _harmonics(direction, rotation, view, line):
 
 
 @njit(**INLINE)
-def _encode(encoding, places, start, count, features, row, scratch):
-    """Features of places [3, .] in the unit box from `start` on, one row each from `row` on."""
+def _encode(encoding, places, axes, start, count, features, row, scratch):
+    """Features of places in the unit box, rows `axes` and on, from sample `start` on; one row each
+    from `row` on."""
     table, levels = encoding
     unit, index, weight = scratch
     step = features.shape[1]
@@ -139,7 +131,7 @@ def _encode(encoding, places, start, count, features, row, scratch):
         for begin in range(0, count, corners.BLOCK):
             n = min(corners.BLOCK, count - begin)
             for axis in range(3):
-                source = places[axis, start + begin : start + begin + n]
+                source = places[axes + axis, start + begin : start + begin + n]
                 for i in range(n):
                     unit[axis * corners.BLOCK + i] = source[i]
             corners.locate_block(unit, n, res, entry, mask, table, index, weight)
@@ -149,7 +141,7 @@ def _encode(encoding, places, start, count, features, row, scratch):
 
 
 @njit(**INLINE)
-def _embed(surface, mesh_corners, triangle, barycentric, begin, count, index, weight, out, step):
+def _embed(surface, mesh_corners, triangle, places, begin, count, index, weight, out, step):
     """The appearance's features at samples from `begin` on, one row of out each."""
     latent, width, side, uvs = surface
     if width == 0:
@@ -158,7 +150,7 @@ def _embed(surface, mesh_corners, triangle, barycentric, begin, count, index, we
         for i in range(count):
             for k in range(3):
                 index[k * rows.STRIDE + i] = mesh_corners[triangle[begin + i] * 3 + k]
-                weight[k * rows.STRIDE + i] = barycentric[begin + i, k]
+                weight[k * rows.STRIDE + i] = places[WEIGHTS + k, begin + i]
         for i in range(count):
             rows.mix3(latent, width, index, weight, i, out, (begin + i) * step)
         return
@@ -167,8 +159,8 @@ def _embed(surface, mesh_corners, triangle, barycentric, begin, count, index, we
         u = v = np.float32(0)
         for k in range(3):
             at = (triangle[begin + i] * 3 + k) * 2
-            u += barycentric[begin + i, k] * uvs[at]
-            v += barycentric[begin + i, k] * uvs[at + 1]
+            u += places[WEIGHTS + k, begin + i] * uvs[at]
+            v += places[WEIGHTS + k, begin + i] * uvs[at + 1]
         x, fx = rows.texel(u, side)
         y, fy = rows.texel(v, side)
         for k in range(4):
@@ -180,26 +172,32 @@ def _embed(surface, mesh_corners, triangle, barycentric, begin, count, index, we
 
 
 @njit(**INLINE)
-def densities(start, stop, field, mesh_corners, samples, work, inputs, sigma):
+def densities(start, stop, field, mesh_corners, samples, features, inputs, sigma):
     """What the networks see of samples start..stop, and their densities (1/m)."""
     encodings, networks, _, latent, untrained = field
-    triangle, barycentric, distance, places, resting = samples
-    features, corner_scratch, index, weight, density_work, offset_work = work
+    triangle, places = samples
+    corner_scratch = (
+        np.zeros(3 * corners.BLOCK, np.float32),
+        np.zeros(8 * corners.STRIDE, np.int32),
+        np.zeros(8 * corners.STRIDE, np.float32),
+    )
+    index, weight = np.zeros(4 * rows.STRIDE, np.int64), np.zeros(4 * rows.STRIDE, np.float32)
+    density_work, offset_work = workspace(networks[0][0]), workspace(networks[1][0])
     (plan, packed), (offset_plan, offset), has_offset = networks
     room = features.shape[1]
     embedding, geometry = latent[1], plan[-1, OUT]
     columns = embedding + geometry
     no_rows, no_group = np.zeros((0, 0), np.float32), np.zeros(0, np.int32)
     zero, one = np.int64(0), np.int64(1)
-    _encode(encodings[0], places, start, stop - start, features, 0, corner_scratch)
+    _encode(encodings[0], places, 0, start, stop - start, features, 0, corner_scratch)
     rest = 2 * len(encodings[0][1])
-    _encode(encodings[1], resting, start, stop - start, features, rest, corner_scratch)
+    _encode(encodings[1], places, RESTING, start, stop - start, features, rest, corner_scratch)
     seen = features.ravel()
     for begin in range(start, stop, BLOCK):
         n = min(BLOCK, stop - begin)
         through_layers(zero, n, n, len(plan), seen, begin - start, one, room, packed, plan, no_rows,
                        no_group, density_work)  # fmt: skip
-        _embed(latent, mesh_corners, triangle, barycentric, begin, n, index, weight, inputs,
+        _embed(latent, mesh_corners, triangle, places, begin, n, index, weight, inputs,
                columns)  # fmt: skip
         at, wide = plan[-1, HIDDEN], plan[-1, OUT_PAD]
         for i in range(n):
@@ -213,7 +211,7 @@ def densities(start, stop, field, mesh_corners, samples, work, inputs, sigma):
             for i in range(n):
                 inputs[(begin + i) * columns + embedding] += offset_work[at + i * wide]
         for i in range(begin, begin + n):
-            raw = inputs[i * columns + embedding] + _untrained(distance[i], untrained)
+            raw = inputs[i * columns + embedding] + _untrained(places[DISTANCE, i], untrained)
             sigma[i] = np.exp(min(raw, untrained[4])) * np.float32(1e3)
 
 

@@ -14,7 +14,18 @@ from numba import njit
 
 from ..reference.picking import BRICK
 from ..structures import Clearance, Frozen, PosedMesh, Probing, Traced, Voxels
-from .frozen import ROOM, arrays_of, columns_of, densities, room_for, shade
+from .frozen import (
+    DISTANCE,
+    PLACES,
+    RESTING,
+    ROOM,
+    WEIGHTS,
+    arrays_of,
+    columns_of,
+    densities,
+    features_for,
+    shade,
+)
 from .lanes import LANES, load, splat_int
 from .marching import clear_cells, flat, locate, rows_of, walk
 from .mlp import BLOCK, workspace
@@ -154,17 +165,19 @@ def _runs(ray, first, last, rays, space, left, lengths_of, begins,
 
 
 @njit(**INLINE)
-def _find(start, stop, base, asked, count, rays, surface, grid, frames, feet, packet,
-          samples):  # fmt: skip
+def _find(start, stop, base, asked, count, rays, surface, grid, frames, feet, samples):
     """Where requests start..stop lie: each gets a sample, from `count` on, or -1 where nothing can
     be; returns how many samples there are then."""
     origins, directions, step = rays
     arrays, triangle_maps, vertex_maps, vertices, mesh_corners, band = surface
     cells, size, grid_corner, grid_scale = grid
     unit_corner, unit_scale, still, _ = frames
-    want_row, want_k, sample_of = asked
-    stack, scratch, points, near, canonical, distances, weights, found = packet
-    triangle, barycentric, distance, places, resting = samples
+    want_row, want_k, sample_of = asked[0], asked[1], asked[2]
+    stack, scratch = np.empty(STACK, np.int32), np.empty(LANES, np.float32)
+    points, near = np.empty(3 * LANES, np.float32), np.full(3 * LANES, np.inf, np.float32)
+    canonical, weights = np.empty(3 * LANES, np.float32), np.empty(3 * LANES, np.float32)
+    distances, found = np.empty(LANES, np.float32), np.empty(LANES, np.int32)
+    triangle, places = samples
     for begin in range(start, stop, LANES):
         lanes = min(LANES, stop - begin)
         for i in range(LANES):
@@ -192,25 +205,25 @@ def _find(start, stop, base, asked, count, rays, surface, grid, frames, feet, pa
                 continue
             sample_of[begin + i] = count
             triangle[count] = found[i]
-            distance[count] = distances[i]
+            places[DISTANCE, count] = distances[i]
             for axis in range(3):
-                barycentric[count, axis] = weights[axis * LANES + i]
+                places[WEIGHTS + axis, count] = weights[axis * LANES + i]
                 place = (canonical[axis * LANES + i] - unit_corner[axis]) * unit_scale
                 places[axis, count] = min(max(place, np.float32(0)), np.float32(1))
                 place = still[axis, 3]
                 for k in range(3):
                     place += still[axis, k] * points[k * LANES + i]
                 place = (place - unit_corner[axis]) * unit_scale
-                resting[axis, count] = min(max(place, np.float32(0)), np.float32(1))
+                places[RESTING + axis, count] = min(max(place, np.float32(0)), np.float32(1))
             count += 1
     return count
 
 
 @njit(**INLINE)
-def _ask_middles(living, alive, runs, asked):
+def _ask_middles(living, alive, chosen, runs, asked):
     """The middles of all runs, sixteen rays side by side; returns how many."""
-    chosen, begins, lengths, middle, before, after = runs
-    want_row, want_k, _ = asked
+    begins, lengths, middle, before, after = runs[0], runs[1], runs[2], runs[3], runs[4]
+    want_row, want_k = asked[0], asked[1]
     count = 0
     for begin in range(0, living, LANES):
         for slot in range(begins.shape[1]):
@@ -225,10 +238,12 @@ def _ask_middles(living, alive, runs, asked):
 
 
 @njit(**INLINE)
-def _mark(living, alive, base, runs, sample_of, sigma, step, lefts, tolerance, transmittance):
+def _mark(
+    living, alive, base, chosen, runs, sample_of, sigma, step, lefts, tolerance, transmittance
+):
     """Which runs to take apart: before its middle, where a run shows, and after it what lies behind
     the middle of the run that comes before; after its own where light still passes."""
-    chosen, begins, lengths, middle, before, after = runs
+    begins, lengths, middle, before, after = runs[0], runs[1], runs[2], runs[3], runs[4]
     for a in range(living):
         left = lefts[base + alive[a]]
         for slot in range(chosen[a]):
@@ -249,20 +264,21 @@ def _mark(living, alive, base, runs, sample_of, sigma, step, lefts, tolerance, t
 
 
 @njit(**INLINE)
-def _ask_rest(living, alive, runs, asked, count):
+def _ask_rest(living, alive, chosen, runs, asked, count):
     """The places beside the middles of marked runs; returns how many requests there are then."""
-    chosen, begins, lengths, _, before, after = runs
-    want_row, want_k, _ = asked
+    begins, lengths, before, after = runs[0], runs[1], runs[3], runs[4]
+    want_row, want_k = asked[0], asked[1]
     for begin in range(0, living, LANES):
         for slot in range(begins.shape[1]):
-            for part in (before, after):
+            for side in range(2):
                 for a in range(begin, min(begin + LANES, living)):
+                    part = before if side == 0 else after
                     if slot >= chosen[a] or part[a, slot] != _WANTED:
                         continue
                     part[a, slot] = count
                     half = lengths[a, slot] // 2
-                    low = 0 if part is before else half + 1
-                    high = half if part is before else lengths[a, slot]
+                    low = 0 if side == 0 else half + 1
+                    high = half if side == 0 else lengths[a, slot]
                     for place in range(low, high):
                         want_row[count] = alive[a]
                         want_k[count] = begins[a, slot] + place
@@ -271,11 +287,11 @@ def _ask_rest(living, alive, runs, asked, count):
 
 
 @njit(**INLINE)
-def _add_up(a, ray, runs, asked, sigma, step, left, depth, negligible, row, showing, shown,
+def _add_up(a, ray, chosen, runs, asked, sigma, step, left, depth, negligible, row, showing, shown,
             shown_row, shown_weight):  # fmt: skip
     """One ray through its samples: what is left of it, its depth, and how many samples show."""
-    chosen, _, lengths, middle, before, after = runs
-    _, want_k, sample_of = asked
+    lengths, middle, before, after = runs[1], runs[2], runs[3], runs[4]
+    want_k, sample_of = asked[1], asked[2]
     for slot in range(chosen[a]):
         half = lengths[a, slot] // 2
         lower, upper = before[a, slot], after[a, slot]
@@ -320,38 +336,19 @@ def _trace(total, walked, space, frames, field, lengths_of, limits, outputs):
     columns = columns_of(field)
     most = GROUP * width * longest  # requests of a wave, every run taken apart
     room = most + ROOM
-    packet = (
-        np.empty(STACK, np.int32),
-        np.empty(LANES, np.float32),
-        np.empty(3 * LANES, np.float32),
-        np.full(3 * LANES, np.inf, np.float32),
-        np.empty(3 * LANES, np.float32),
-        np.empty(LANES, np.float32),
-        np.empty(3 * LANES, np.float32),
-        np.empty(LANES, np.int32),
-    )
     alive = np.empty(GROUP, np.int32)
     feet = np.empty((GROUP, 3), np.float32)
     following = np.zeros(GROUP, np.int32)
-    runs = (
-        np.zeros(GROUP, np.int32),  # how many a ray has
-        np.zeros((GROUP, width), np.int32),  # lattice index each begins at
-        np.zeros((GROUP, width), np.int32),  # length
-        np.zeros((GROUP, width), np.int32),  # the request of its middle
-        np.zeros((GROUP, width), np.int32),  # the first request of what lies before that, or _NONE
-        np.zeros((GROUP, width), np.int32),  # and after
-    )
-    chosen, begins, lengths = runs[:3]
+    chosen = np.zeros(GROUP, np.int32)  # how many runs a ray has
+    # of each: the lattice index it begins at, its length, the request of its middle, the first
+    # request of what lies before that, or _NONE, and after
+    runs = np.zeros((5, GROUP, width), np.int32)
     # requests: ray, lattice index, sample or -1
-    asked = np.zeros(most, np.int32), np.zeros(most, np.int32), np.zeros(most, np.int32)
-    samples = (
-        np.zeros(room, np.int32),  # triangle
-        np.zeros((room, 3), np.float32),  # barycentrics
-        np.zeros(room, np.float32),  # distance
-        np.zeros((3, room), np.float32),  # canonical place in the unit box
-        np.zeros((3, room), np.float32),  # the place that rests with the shoulders
-    )
-    work = room_for(field, most)
+    asked = np.zeros((3, most), np.int32)
+    # triangles; canonical places in the unit box, those that rest with the shoulders, barycentrics,
+    # distances (`frozen`)
+    samples = np.zeros(room, np.int32), np.zeros((PLACES, room), np.float32)
+    features = features_for(field, most)
     inputs = np.zeros(room * columns, np.float32)
     sigma = np.zeros(room, np.float32)
     views = np.zeros((GROUP, field[2][2].shape[1]), np.float32)
@@ -374,31 +371,31 @@ def _trace(total, walked, space, frames, field, lengths_of, limits, outputs):
             for a in range(living):
                 ray = base + alive[a]
                 chosen[a], following[a] = _runs(
-                    ray, first[ray], last[ray], rays, space, out_left[ray], lengths_of, begins[a],
-                    lengths[a])  # fmt: skip
+                    ray, first[ray], last[ray], rays, space, out_left[ray], lengths_of, runs[0, a],
+                    runs[1, a])  # fmt: skip
             count, known, requests = 0, 0, 0
             for part in range(2):  # the middles of runs, then what lies beside them
                 if part == 0:
-                    requests = _ask_middles(living, alive, runs, asked)
+                    requests = _ask_middles(living, alive, chosen, runs, asked)
                 elif tolerance < 1:
-                    _mark(living, alive, base, runs, asked[2], sigma, step, out_left, tolerance,
-                          transmittance)  # fmt: skip
+                    _mark(living, alive, base, chosen, runs, asked[2], sigma, step, out_left,
+                          tolerance, transmittance)  # fmt: skip
                     known = requests
-                    requests = _ask_rest(living, alive, runs, asked, known)
+                    requests = _ask_rest(living, alive, chosen, runs, asked, known)
                 else:
                     break
                 begin = count
                 count = _find(known, requests, base, asked, begin, rays, surface, grid, frames,
-                              feet, packet, samples)  # fmt: skip
-                densities(begin, count, field, mesh_corners, samples, work, inputs, sigma)
+                              feet, samples)  # fmt: skip
+                densities(begin, count, field, mesh_corners, samples, features, inputs, sigma)
             evaluations += count
             showing, going_on = 0, 0
             for a in range(living):
                 row = alive[a]
                 ray = base + row
                 out_left[ray], out_depth[ray], showing = _add_up(
-                    a, ray, runs, asked, sigma, step, out_left[ray], out_depth[ray], negligible,
-                    row, showing, shown, shown_row, shown_weight)  # fmt: skip
+                    a, ray, chosen, runs, asked, sigma, step, out_left[ray], out_depth[ray],
+                    negligible, row, showing, shown, shown_row, shown_weight)  # fmt: skip
                 first[ray] = following[a]
                 if following[a] <= last[ray] and out_left[ray] > transmittance:
                     alive[going_on] = row
