@@ -74,6 +74,34 @@ def pick(
 
 
 @njit(**INLINE)
+def _until(x, d, cell, clear):
+    """How far along the ray x leaves the cells that are nearer than `clear` to this one."""
+    if d > 0:
+        return (np.float32(cell + clear) - x) / d
+    if d < 0:
+        return (np.float32(cell + 1 - clear) - x) / d
+    return np.float32(np.inf)
+
+
+@njit(**INLINE)
+def visit(x, y, z, dx, dy, dz, bricks, brick_count):
+    """The flat voxel of a place (x, y, z), in bricks, or -1 where there is none; and how far along
+    the direction (dx, dy, dz) there will be none either."""
+    nothing = np.float32(0)
+    if not (min(x, y, z) >= 0 and max(x, y, z) < np.float32(brick_count)):
+        return np.int64(-1), nothing
+    u, v, w = int(x), int(y), int(z)
+    row = bricks[(u * brick_count + v) * brick_count + w]
+    if row < 0:  # up to where the ray leaves the bricks that are clear as well
+        leave = min(_until(x, dx, u, -row), _until(y, dy, v, -row), _until(z, dz, w, -row))
+        return np.int64(-1), leave
+    u = int((x - np.float32(u)) * BRICK)
+    v = int((y - np.float32(v)) * BRICK)
+    w = int((z - np.float32(w)) * BRICK)
+    return np.int64(((row * BRICK + u) * BRICK + v) * BRICK + w), nothing
+
+
+@njit(**INLINE)
 def _choose(ray, first, last, origins, directions, jitter, step, bricks, brick_count, cells, corner,
             scale, guide, chance, left, share, longest, opaque, width, k_out,
             steps_out):  # fmt: skip
@@ -82,28 +110,16 @@ def _choose(ray, first, last, origins, directions, jitter, step, bricks, brick_c
     oy = (origins[ray, 1] - corner[1]) * scale
     oz = (origins[ray, 2] - corner[2]) * scale
     dx, dy, dz = directions[ray, 0] * scale, directions[ray, 1] * scale, directions[ray, 2] * scale
-    end = np.float32(brick_count)
     count, looks, length, begin = 0, 0, 0, 0
     added, passed = np.float32(0.0), np.float32(0.0)
     k = first
     while k <= last:
         t = (np.float32(k) + jitter) * step
-        x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
         k += 1
-        if not (min(x, y, z) >= 0 and max(x, y, z) < end):
-            continue
-        u, v, w = int(x), int(y), int(z)
-        row = bricks[(u * brick_count + v) * brick_count + w]
-        if row < 0:
-            # up to where the ray leaves the bricks that are clear as well
-            leave = min(until(x, dx, u, -row), until(y, dy, v, -row), until(z, dz, w, -row))
-            k += max(np.int64(min(leave / step, np.float32(last - k))), 0)
-            continue
-        u = int((x - np.float32(u)) * BRICK)
-        v = int((y - np.float32(v)) * BRICK)
-        w = int((z - np.float32(w)) * BRICK)
-        cell = cells[((row * BRICK + u) * BRICK + v) * BRICK + w]
+        voxel, clear = visit(ox + t * dx, oy + t * dy, oz + t * dz, dx, dy, dz, bricks, brick_count)
+        cell = cells[voxel] if voxel >= 0 else -1
         if cell < 0:
+            k += max(np.int64(min(clear / step, np.float32(last - k))), 0)
             continue
         optical = guide[cell] * step
         more = left * (np.float32(1.0) - np.exp(-optical))
@@ -126,16 +142,6 @@ def _choose(ray, first, last, origins, directions, jitter, step, bricks, brick_c
     if length > 0:
         count, chance = _close(k_out, steps_out, count, begin, length, chance)
     return count, looks, k
-
-
-@njit(**INLINE)
-def until(x, d, cell, clear):
-    """How far along the ray x leaves the cells that are nearer than `clear` to this one."""
-    if d > 0:
-        return (np.float32(cell + clear) - x) / d
-    if d < 0:
-        return (np.float32(cell + 1 - clear) - x) / d
-    return np.float32(np.inf)
 
 
 @njit(**INLINE)

@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from numba import njit
 
-from ..reference.picking import BRICK
 from ..structures import Clearance, Frozen, PosedMesh, Probing, Traced, Voxels
 from .frozen import (
     DISTANCE,
@@ -29,7 +28,7 @@ from .frozen import (
 from .lanes import LANES, load, splat_int
 from .marching import clear_cells, flat, locate, rows_of, walk
 from .mlp import BLOCK, workspace
-from .picking import until
+from .picking import visit
 from .search import INLINE, OPTIONS, STACK
 from .threads import run_chunks
 
@@ -123,27 +122,15 @@ def _runs(ray, first, last, rays, space, left, lengths_of, begins,
     oy = (origins[ray, 1] - corner[1]) * scale
     oz = (origins[ray, 2] - corner[2]) * scale
     dx, dy, dz = directions[ray, 0] * scale, directions[ray, 1] * scale, directions[ray, 2] * scale
-    end = np.float32(brick_count)
     count, length, added = -1, 0, np.float32(0.0)
     k = first
     while k <= last:
         t = (np.float32(k) + np.float32(0.5)) * step
-        x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
         k += 1
-        if not (min(x, y, z) >= 0 and max(x, y, z) < end):
-            continue
-        u, v, w = int(x), int(y), int(z)
-        row = bricks[(u * brick_count + v) * brick_count + w]
-        if row < 0:
-            # up to where the ray leaves the bricks that are clear as well
-            leave = min(until(x, dx, u, -row), until(y, dy, v, -row), until(z, dz, w, -row))
-            k += max(np.int64(min(leave / step, np.float32(last - k))), 0)
-            continue
-        u = int((x - np.float32(u)) * BRICK)
-        v = int((y - np.float32(v)) * BRICK)
-        w = int((z - np.float32(w)) * BRICK)
-        density = thin[((row * BRICK + u) * BRICK + v) * BRICK + w]
+        voxel, clear = visit(ox + t * dx, oy + t * dy, oz + t * dz, dx, dy, dz, bricks, brick_count)
+        density = thin[voxel] if voxel >= 0 else np.float32(-1)
         if density < 0:
+            k += max(np.int64(min(clear / step, np.float32(last - k))), 0)
             continue
         more = left * min(density * step, np.float32(1))
         together = (
