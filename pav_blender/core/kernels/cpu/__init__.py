@@ -88,7 +88,7 @@ def _tell_of_compiling() -> None:
     global _told
     if not _told and not any(Path(os.environ["NUMBA_CACHE_DIR"]).rglob("*.nbi")):
         print(
-            "pav: compiling kernels for this processor, once; it takes about half a minute",
+            "pav: compiling kernels for this processor, once; it takes about 40 seconds",
             file=sys.stderr,
             flush=True,
         )
