@@ -11,13 +11,15 @@ import numpy as np
 import pytest
 
 from pav_blender.benchmarks import kernels as kernels_bench
-from pav_blender.benchmarks import scale
+from pav_blender.benchmarks import memory, scale
 from pav_blender.benchmarks.measure import Options, a_frame, best, collection_of, plot
 from pav_blender.benchmarks.plain import dense
 from pav_blender.benchmarks.render import SKIPS, _front, _picture, _skips
-from pav_blender.core.errors import InputError
+from pav_blender.core.collection import read_collection
+from pav_blender.core.errors import InputError, PavError
 from pav_blender.core.evaluation.metrics import over, psnr
 from pav_blender.core.rendering.render import RenderSettings
+from pav_blender.core.training.prepare import load_training_frames
 
 
 def test_the_reference_preset_is_what_plain_torch_gives(toy, toy_avatar):
@@ -97,3 +99,31 @@ def test_compiling_is_announced_once(tmp_path):
     assert said().count("compiling kernels") == 1
     (tmp_path / "kernel.nbi").touch()
     assert "compiling" not in said()
+
+
+def test_the_enlarged_collection_is_as_long_and_large_as_it_says(toy, tmp_path, monkeypatch):
+    for name, value in {"_CLIPS": 3, "_FRAMES": 15, "_SIZE": 96}.items():
+        monkeypatch.setattr(memory, name, value)
+    memory._enlarged(toy, tmp_path / "large", None)
+    large = read_collection(tmp_path / "large")
+    frames = load_training_frames(large)
+    assert len(frames) == 45
+    assert {f.rgba.shape for f in frames} == {(96, 96, 4)}
+    assert len(large.appearances) == 3
+    first = frames[0]
+    again = next(f for f in frames[1:] if f.appearance == 0 and (f.rgba == first.rgba).all())
+    np.testing.assert_array_equal(again.vertices, first.vertices)  # the same frame, over again
+    small = load_training_frames(toy)[0]
+    pixels, _ = first.camera.project(small.vertices)
+    np.testing.assert_allclose(pixels / 96, small.camera.project(small.vertices)[0] / 64, atol=1e-4)
+    assert (first.rgba[..., 3] > 0).mean() == pytest.approx(
+        (small.rgba[..., 3] > 0).mean(), abs=0.02
+    )
+
+
+def test_memory_is_that_of_the_process(tmp_path):
+    hungry = f"held = bytearray({300 * 1000**2})\n{memory._PEAK}"
+    found = memory._measured("hungry", hungry)["peak_gb"]
+    assert 0.3 <= found < 0.6
+    with pytest.raises(PavError, match="broken: ZeroDivisionError"):
+        memory._measured("broken", "1 / 0")

@@ -9,7 +9,9 @@ from pathlib import Path
 CODE = """
 from pav_blender.cli import main
 from pav_blender.core.kernels.cpu import encoding, marching, mlp, nearest, optimiser, picking
+from pav_blender.core.kernels.cpu import tracing
 kernels = (picking._pick, picking._follow, picking._brick_cells, marching._march, nearest._nearest,
+           picking._add_torn, tracing._trace, tracing._look_up,
            mlp._forward_samples, mlp._backward_parts, encoding._encode_levels,
            encoding._adam_levels, optimiser.adam_range)
 assert not any(kernel.signatures for kernel in kernels)

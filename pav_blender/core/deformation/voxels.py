@@ -19,7 +19,7 @@ from .occupancy import clearance
 
 _VOXEL = 0.003  # metres
 _STRETCH = 1.4  # of the map from posed to canonical space that is allowed for
-_BESIDE = 1.2  # times the margin of a cube: what is beside it may be torn from it
+_BESIDE = 2.0  # times the margin of a cube: what is beside it may be torn from it
 _SIDES = (16, 8, 4)  # in voxels, of the cubes that are looked at one after the other
 
 

@@ -52,7 +52,9 @@ def tiled(width: int, height: int) -> np.ndarray:
     pixels = np.arange(width * height)
     row, column = pixels // width, pixels % width
     tiles = (row // TILE * -(-width // TILE) + column // TILE) * TILE**2
-    return np.argsort(tiles + row % TILE * TILE + column % TILE)
+    order = np.argsort(tiles + row % TILE * TILE + column % TILE)
+    order.setflags(write=False)  # every caller has the same one
+    return order
 
 
 @dataclass(eq=False)

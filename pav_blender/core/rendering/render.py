@@ -7,6 +7,7 @@ import weakref
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,6 +17,7 @@ from ..deformation import Clearance, Deformer, PosedMesh, Thrift, Voxels, cleara
 from ..deformation.rigid import Stance, stance
 from ..errors import Cancelled, InputError
 from ..field.avatar import Avatar
+from ..field.directions import spherical_harmonics
 from ..field.field import Worn, condition
 from ..field.frozen import freeze
 from ..kernels.cpu.threads import run_chunks, torch_alone
@@ -94,13 +96,19 @@ class Scene:
     worn: Worn
 
     @cached_property
-    def thickness(self) -> torch.Tensor:
+    def known(self) -> torch.Tensor:
         """What the guide knows of the density in each voxel."""
-        return kernels.select("cpu").tracing.thickness(self.voxels, self.guide)
+        return kernels.select("cpu").tracing.known_density(self.voxels, self.guide)
 
     @cached_property
     def frozen(self) -> Frozen:
+        """The field held still."""
         return freeze(self.avatar.field, self.condition, self.worn)
+
+    @cached_property
+    def packed(self) -> tuple[Any, ...]:
+        """The same as compiled functions take it."""
+        return kernels.select("cpu").tracing.arrays_of(self.frozen)
 
 
 _deformers: weakref.WeakKeyDictionary[Avatar, Deformer] = weakref.WeakKeyDictionary()
@@ -222,7 +230,7 @@ def render(
     if region is not None:
         camera = camera.window(*region)
     caller, done, evaluations = threading.get_ident(), 0, 0
-    adding = threading.Lock()
+    counting = threading.Lock()
     with torch.inference_mode(), torch_alone():
         scene = pose_scene(avatar, vertices, appearance, expression)
         order = tiled(camera.width, camera.height)
@@ -240,7 +248,7 @@ def render(
             rays = camera_rays(camera, pixels % camera.width, pixels // camera.width)
             with torch.inference_mode():
                 rgba[pixels], depth[pixels], evaluated = _trace(scene, rays, settings)
-            with adding:
+            with counting:
                 done, evaluations = done + stop - start, evaluations + evaluated
             if ours and progress is not None:
                 progress(min(1.0, done / count))
@@ -277,12 +285,13 @@ def _whole(scene: Scene, rays: RayBatch, settings: RenderSettings) -> Traced:
     near, far = ops.marching.bounds(scene.voxels.box, 0.0, rays.origins, rays.directions)
     half = torch.full((len(rays),), 0.5)
     first, last = ops.marching.lattice(near, far, half, settings.step)
+    turned = rays.directions @ torch.from_numpy(stance.rotation)
     still = np.concatenate([stance.shoulders.T, stance.offset[:, None]], 1)
     return ops.tracing.trace(
         scene.mesh,
         scene.voxels,
-        scene.thickness,
-        scene.frozen,
+        scene.known,
+        scene.packed,
         rays.origins,
         rays.directions,
         first,
@@ -291,7 +300,7 @@ def _whole(scene: Scene, rays: RayBatch, settings: RenderSettings) -> Traced:
         clearance=scene.clearance,
         band=scene.avatar.config.reach,
         still=torch.from_numpy(still),
-        rotation=torch.from_numpy(stance.rotation),
+        views=spherical_harmonics(turned) @ scene.frozen.view,
         probing=Probing(
             settings.wave,
             settings.share,
@@ -312,7 +321,7 @@ def _by_waves(scene: Scene, rays: RayBatch, settings: RenderSettings) -> Traced:
     device = field.device
     colour = torch.zeros(count, 4, device=device)
     depth, left = torch.zeros(count, device=device), torch.ones(count, device=device)
-    ops, adding = kernels.select("cpu"), kernels.select(device)
+    ops, there = kernels.select("cpu"), kernels.select(device)
     jitter = torch.full((count,), 0.5)
     around = (scene.voxels.box, 0.0) if settings.skip else (scene.mesh.vertices, reach)
     near, far = ops.marching.bounds(*around, rays.origins, rays.directions)
@@ -331,7 +340,7 @@ def _by_waves(scene: Scene, rays: RayBatch, settings: RenderSettings) -> Traced:
             width = torch.full_like(sigma, settings.step)
             if isinstance(wave, Picks):
                 width *= wave.steps.view(-1)[slots].to(device)
-            weights = adding.marching.weigh(sigma, width, ray.int(), left)
+            weights = there.marching.weigh(sigma, width, ray.int(), left)
             depth.index_add_(0, ray, weights * packed.t.to(device))
             shown = (weights > settings.negligible * width).nonzero()[:, 0]
             rgb = field.shade(inputs[shown], samples.direction, samples.ray[shown])

@@ -146,7 +146,8 @@ class Trainer:
     def _draw(self, group: int, count: int) -> int:
         """A frame of `count`. Of a long clip only some are in use at a time, and new ones take
         their place little by little: to pose a frame takes as long as to learn from it."""
-        size = max(1, KEPT_POSES // len(self._pyramid[0]))
+        # the rest is for those whose place was just taken, until they are forgotten
+        size = max(1, KEPT_POSES * 3 // 4 // len(self._pyramid[0]))
         if count <= size:
             return int(self.random.integers(count))
         pool = self.pools.setdefault(group, [])

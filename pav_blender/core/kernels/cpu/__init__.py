@@ -88,7 +88,7 @@ def _tell_of_compiling() -> None:
     global _told
     if not _told and not any(Path(os.environ["NUMBA_CACHE_DIR"]).rglob("*.nbi")):
         print(
-            "pav: compiling kernels for this processor, once; it takes about 40 seconds",
+            "pav: compiling kernels for this processor, once; it takes most of a minute",
             file=sys.stderr,
             flush=True,
         )

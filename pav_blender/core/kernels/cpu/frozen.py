@@ -19,7 +19,6 @@ from .marching import flat, rows_of
 from .mlp import BLOCK, HIDDEN, OUT, OUT_PAD, pack, through_layers, workspace
 from .search import INLINE
 
-HARMONICS = 16
 # rows of a sample's places: canonical in the unit box, resting with the shoulders, barycentrics,
 # distance from the mesh
 RESTING, WEIGHTS, DISTANCE, PLACES = 3, 6, 9, 10
@@ -32,7 +31,7 @@ def arrays_of(field: Frozen) -> tuple[Any, ...]:
     return (
         _encodings(field),
         (_packed(field.density), _packed(field.offset), field.offset is not None),
-        (*_packed(field.colour), rows_of(field.view, np.float32)),
+        _packed(field.colour),
         _latent(field),
         np.array([*field.untrained, field.limit], np.float32),
     )
@@ -78,44 +77,6 @@ def _untrained(distance, settings):
     near = distance / settings[2] - settings[3]
     near = np.float32(1) - min(max(near, np.float32(0)), np.float32(1))
     return settings[0] + near * settings[1]
-
-
-@njit(**INLINE)
-def _harmonics(direction, rotation, view, line):
-    """line = the basis of `field.directions` in a turned direction, through `view` [16, hidden]."""
-    x = y = z = np.float32(0)
-    for k in range(3):
-        x += direction[k] * rotation[k, 0]
-        y += direction[k] * rotation[k, 1]
-        z += direction[k] * rotation[k, 2]
-    xx, yy, zz = x * x, y * y, z * z
-    xy, yz, xz = x * y, y * z, x * z
-    one = np.float32(1)
-    basis = (
-        np.float32(0.28209479) * one,
-        np.float32(-0.48860251) * y,
-        np.float32(0.48860251) * z,
-        np.float32(-0.48860251) * x,
-        np.float32(1.09254843) * xy,
-        np.float32(-1.09254843) * yz,
-        np.float32(0.94617470) * zz - np.float32(0.31539157),
-        np.float32(-1.09254843) * xz,
-        np.float32(0.54627422) * (xx - yy),
-        np.float32(-0.59004359) * y * (np.float32(3) * xx - yy),
-        np.float32(2.89061144) * xy * z,
-        np.float32(-0.45704580) * y * (np.float32(5) * zz - one),
-        np.float32(0.37317633) * z * (np.float32(5) * zz - np.float32(3)),
-        np.float32(-0.45704580) * x * (np.float32(5) * zz - one),
-        np.float32(1.44530572) * z * (xx - yy),
-        np.float32(-0.59004359) * x * (xx - np.float32(3) * yy),
-    )
-    width = view.shape[1]
-    line[:] = 0
-    for k in range(HARMONICS):
-        value = basis[k]
-        source = view[k]
-        for i in range(width):
-            line[i] += value * source[i]
 
 
 @njit(**INLINE)
@@ -216,24 +177,20 @@ def densities(start, stop, field, mesh_corners, samples, features, inputs, sigma
 
 
 @njit(**INLINE)
-def shade(count, base, rays, rotation, field, inputs, shown, shown_row, shown_weight, views, viewed,
-          lit, work, out):  # fmt: skip
+def shade(count, base, views, field, inputs, shown, shown_row, shown_weight, lit, work, out):
     """Add to rows `base` + shown_row of out the colours of `count` samples by their weights, and
-    the weights; views [rays, hidden] are filled as they are needed."""
-    plan, packed, view = field[2]
+    the weights; views [rays, hidden]: what each ray's direction adds to the first layer."""
+    plan, packed = field[2]
     columns = columns_of(field)
     zero, one = np.int64(0), np.int64(1)
+    group = views[base:]
     for begin in range(0, count, BLOCK):
         n = min(BLOCK, count - begin)
         for i in range(n):
-            row = shown_row[begin + i]
-            if not viewed[row]:
-                viewed[row] = True
-                _harmonics(rays[1][base + row], rotation, view, views[row])
             source = shown[begin + i] * columns
             for k in range(columns):
                 lit[i * columns + k] = inputs[source + k]
-        through_layers(begin, n, n, len(plan), lit, zero, columns, one, packed, plan, views,
+        through_layers(begin, n, n, len(plan), lit, zero, columns, one, packed, plan, group,
                        shown_row, work)  # fmt: skip
         at, wide = plan[-1, HIDDEN], plan[-1, OUT_PAD]
         for i in range(n):

@@ -8,11 +8,13 @@ met finely. `rendering.render` does the same step by step, without runs.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from numba import njit
 
-from ..structures import Clearance, Frozen, PosedMesh, Probing, Traced, Voxels
+from ..structures import Clearance, PosedMesh, Probing, Traced, Voxels
 from .frozen import (
     DISTANCE,
     PLACES,
@@ -32,11 +34,13 @@ from .picking import visit
 from .search import INLINE, OPTIONS, STACK
 from .threads import run_chunks
 
+__all__ = ["arrays_of", "known_density", "trace"]
+
 GROUP = 256  # rays that advance together
 _NONE, _WANTED = -1, -2
 
 
-def thickness(voxels: Voxels, guide: torch.Tensor) -> torch.Tensor:
+def known_density(voxels: Voxels, guide: torch.Tensor) -> torch.Tensor:
     """What a guide [G, G, G] knows of the density in each voxel [B, 4, 4, 4], -1 where it has no
     cell."""
     found = torch.empty(voxels.cells.shape)
@@ -54,8 +58,8 @@ def _look_up(start, stop, cells, guide, out):
 def trace(
     mesh: PosedMesh,
     voxels: Voxels,
-    thickness: torch.Tensor,
-    field: Frozen,
+    known: torch.Tensor,
+    field: tuple[Any, ...],
     origins: torch.Tensor,
     directions: torch.Tensor,
     first: torch.Tensor,
@@ -65,15 +69,16 @@ def trace(
     clearance: Clearance,
     band: float,
     still: torch.Tensor,
-    rotation: torch.Tensor,
+    views: torch.Tensor,
     probing: Probing,
 ) -> Traced:
     """Rays [R] to their ends, on this thread alone.
 
-    thickness [B, 4, 4, 4]: the density (1/m) that a guide knows in each voxel, negative where
-    nothing can be; first, last [R] int32: the lattice indices to look at, places lying half a step
-    further; band: metres from the mesh beyond which nothing is; still [3, 4]: posed points to where
-    the shoulders do not move; rotation [3, 3]: directions to the head's axes (as rows).
+    known [B, 4, 4, 4]: the density (1/m) that a guide knows of in each voxel, negative where
+    nothing can be; field: what `arrays_of` makes of a `Frozen`; first, last [R] int32: the lattice
+    indices to look at, places lying half a step further; band: metres from the mesh beyond which
+    nothing is; still [3, 4]: posed points to where the shoulders do not move; views [R, hidden]:
+    what a ray's direction adds to the first layer of the colour.
     """
     count = len(origins)
     traced = Traced(torch.zeros(count, 4), torch.zeros(count), torch.ones(count), 0)
@@ -82,7 +87,7 @@ def trace(
     space = (
         rows_of(voxels.bricks.view(-1), np.int32),
         len(voxels.bricks),
-        flat(thickness),
+        flat(known),
         flat(voxels.box_min),
         np.float32(voxels.scale),
     )
@@ -91,8 +96,9 @@ def trace(
         count,
         walked,
         space,
-        (*unit, rows_of(still, np.float32), rows_of(rotation, np.float32)),
-        arrays_of(field),
+        (*unit, rows_of(still, np.float32)),
+        rows_of(views, np.float32),
+        field,
         (
             probing.width,
             np.float32(probing.share),
@@ -158,7 +164,7 @@ def _find(start, stop, base, asked, count, rays, surface, grid, frames, feet, sa
     origins, directions, step = rays
     arrays, triangle_maps, vertex_maps, vertices, mesh_corners, band = surface
     cells, size, grid_corner, grid_scale = grid
-    unit_corner, unit_scale, still, _ = frames
+    unit_corner, unit_scale, still = frames
     want_row, want_k, sample_of = asked[0], asked[1], asked[2]
     stack, scratch = np.empty(STACK, np.int32), np.empty(LANES, np.float32)
     points, near = np.empty(3 * LANES, np.float32), np.full(3 * LANES, np.inf, np.float32)
@@ -311,7 +317,7 @@ def _add_up(a, ray, chosen, runs, asked, sigma, step, left, depth, negligible, r
 
 
 @njit(**OPTIONS)
-def _trace(total, walked, space, frames, field, lengths_of, limits, outputs):
+def _trace(total, walked, space, frames, views, field, lengths_of, limits, outputs):
     (arrays, triangle_maps, vertex_maps, vertices, mesh_corners, origins, directions, first, last,
      _, step, cells, size, grid_corner, grid_scale, band) = walked  # fmt: skip
     surface = arrays, triangle_maps, vertex_maps, vertices, mesh_corners, band
@@ -338,8 +344,6 @@ def _trace(total, walked, space, frames, field, lengths_of, limits, outputs):
     features = features_for(field, most)
     inputs = np.zeros(room * columns, np.float32)
     sigma = np.zeros(room, np.float32)
-    views = np.zeros((GROUP, field[2][2].shape[1]), np.float32)
-    viewed = np.zeros(GROUP, np.bool_)
     shown = np.zeros(room, np.int32)
     shown_row = np.zeros(room, np.int32)
     shown_weight = np.zeros(room, np.float32)
@@ -349,7 +353,6 @@ def _trace(total, walked, space, frames, field, lengths_of, limits, outputs):
     for base in range(0, total, GROUP):
         living = 0
         for i in range(min(GROUP, total - base)):
-            viewed[i] = False
             feet[i, 0] = np.inf
             if first[base + i] <= last[base + i]:
                 alive[living] = i
@@ -388,6 +391,6 @@ def _trace(total, walked, space, frames, field, lengths_of, limits, outputs):
                     alive[going_on] = row
                     going_on += 1
             living = going_on
-            shade(showing, base, rays, frames[3], field, inputs, shown, shown_row, shown_weight,
-                  views, viewed, lit, colour_work, out_colour)  # fmt: skip
+            shade(showing, base, views, field, inputs, shown, shown_row, shown_weight, lit,
+                  colour_work, out_colour)  # fmt: skip
     return evaluations
