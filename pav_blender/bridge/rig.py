@@ -55,10 +55,11 @@ def find_armature(mesh: Any) -> Any | None:
     return None
 
 
-def _build_mesh(head: HeadModel, betas: np.ndarray, name: str, collection: Any) -> Any:
+def mesh_object(head: HeadModel, shaped: np.ndarray, name: str, collection: Any) -> Any:
+    """A mesh object with the head's triangles and UVs and vertices [V, 3] (core axes), linked to a
+    Blender `collection`."""
     import bpy
 
-    shaped = np.asarray(head.shaped(betas), np.float32)
     mesh = bpy.data.meshes.new(name)
     mesh.from_pydata(points_to_blender(shaped).tolist(), [], head.triangles.tolist())
     corners = head.uvs[head.uv_triangles.reshape(-1)]
@@ -68,6 +69,12 @@ def _build_mesh(head: HeadModel, betas: np.ndarray, name: str, collection: Any) 
     mesh.update()
     object_ = bpy.data.objects.new(name, mesh)
     collection.objects.link(object_)
+    return object_
+
+
+def _build_mesh(head: HeadModel, betas: np.ndarray, name: str, collection: Any) -> Any:
+    shaped = np.asarray(head.shaped(betas), np.float32)
+    object_ = mesh_object(head, shaped, name, collection)
     object_.shape_key_add(name="Basis", from_mix=False)
     for key_name, offsets in zip(head.expression_names, head.expression_basis, strict=True):
         _add_key(object_, key_name, shaped + offsets)

@@ -13,7 +13,7 @@ PACKAGE = Path(__file__).parents[2] / "pav_blender"
 OUTER = ["ui", "operators", "bridge", "benchmarks", "studio", "core"]
 INNER = [
     {"evaluation"},
-    {"training", "tracking"},
+    {"training", "tracking", "exporting", "baking"},
     {"rendering"},
     {"field", "deformation"},
     {"kernels"},
