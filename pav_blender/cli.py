@@ -20,6 +20,7 @@ VERBS = {
     "check": "validate and summarise a collection, with an overlay picture",
     "train": "train an avatar on a collection",
     "render": "render an avatar along a track to an image sequence",
+    "bake": "a textured mesh of an avatar, for programs that cannot run its field",
     "export": "a collection in INSTA's or VHAP's layout, or as posed meshes",
     "scene": "build a Blender scene of an avatar on a track",
     "bench": "measure speed against error: render, train, kernels, scale",

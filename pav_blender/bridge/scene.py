@@ -32,19 +32,17 @@ def build_head(avatar_path: Path, appearance: str | None = None) -> Any:
     """
     import bpy
 
-    from ..core.head import load_head
+    from ..core.field.avatar import head_of
     from . import avatars
     from .rig import build_rig
 
     avatar = avatars.load(avatar_path)
     name = avatar.appearances[0] if appearance is None else appearance
     check_appearance(avatar.appearances, name)  # told before anything is built
-    head = load_head(avatar.head_name)
-    if head.fingerprint != avatar.head_fingerprint:
-        raise InputError(
-            f"{avatar_path}: made with another version of the head {avatar.head_name!r}; "
-            "train it again with this one"
-        )
+    try:
+        head = head_of(avatar)
+    except InputError as error:
+        raise InputError(f"{avatar_path}: {error}") from error
     rig = build_rig(head, avatar.betas, avatar_path.stem, bpy.context.scene.collection)
     rig.mesh.pav.avatar = stored_path(avatar_path, bpy.data.filepath)
     choose_appearance(rig.mesh, avatar.appearances, name)

@@ -17,9 +17,17 @@ OPTIONAL = {
     "bpy": "scenes, the studio and rendering through Blender",
     "av": "`pav track`: reading videos",
     "mediapipe": "`pav track`: landmarks and mattes",
-    "skimage": "SSIM in reports",
+    "skimage": "SSIM in reports, and `pav bake`",
+    "xatlas": "`pav bake`, and heads without UVs",
+    "fast_simplification": "`pav bake`",
+    "trimesh": "`pav bake`",
+    "PIL": "`pav bake`",
 }
-_DISTRIBUTIONS = {"skimage": "scikit-image", "OpenImageIO": "OpenImageIO"}
+_DISTRIBUTIONS = {
+    "skimage": "scikit-image",
+    "fast_simplification": "fast-simplification",
+    "PIL": "pillow",
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

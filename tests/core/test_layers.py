@@ -12,8 +12,9 @@ PACKAGE = Path(__file__).parents[2] / "pav_blender"
 # a folder may import those to its right, and itself
 OUTER = ["ui", "operators", "bridge", "benchmarks", "studio", "core"]
 INNER = [
+    {"baking"},
     {"evaluation"},
-    {"training", "tracking", "exporting", "baking"},
+    {"training", "tracking", "exporting"},
     {"rendering"},
     {"field", "deformation"},
     {"kernels"},

@@ -38,7 +38,7 @@ def export_vhap(
     """Writes `out`/<clip>/ for each clip as VHAP exports it; returns how many frames.
 
     images, fg_masks, flame_param, canonical_flame_param.npz, transforms. Timesteps
-    count from 0 whatever the frames' numbers; cameras other than the clip's own are numbered from 1.
+    count from 0 whatever the frames' numbers; held-out cameras from 1.
     """
     total, done = sum(len(clip) for clip in clips), 0
     with new_folder(out) as root:

@@ -16,6 +16,7 @@ import torch
 from ..config import Config
 from ..errors import InputError
 from ..files import replacing
+from ..head import HeadModel, load_head
 from .field import Field
 
 FORMAT = "pav-avatar"
@@ -149,6 +150,17 @@ class Avatar:
             raise InputError(f"{path}: {error}") from error
         except (safetensors.SafetensorError, KeyError, TypeError, ValueError, OSError) as error:
             raise InputError(f"{path}: a damaged avatar file ({error})") from error
+
+
+def head_of(avatar: Avatar) -> HeadModel:
+    """The head model that an avatar was trained on; InputError where it is another by now."""
+    head = load_head(avatar.head_name)
+    if head.fingerprint != avatar.head_fingerprint:
+        raise InputError(
+            f"made with another version of the head {avatar.head_name!r}; train it again with "
+            "this one"
+        )
+    return head
 
 
 def read_header(path: Path | str) -> dict[str, Any]:

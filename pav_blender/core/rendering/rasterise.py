@@ -30,6 +30,23 @@ def rasterise(
     )
 
 
+def cover(points: np.ndarray, triangles: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Triangles of a flat mesh, points [U, 2] in pixels, on a square picture.
+
+    Returns triangle [size, size] int32 (-1 where none covers a pixel's centre; the first where
+    several do) and barycentrics [size, size, 3] float32.
+    """
+    _, index, barycentric = _fill(
+        np.ascontiguousarray(points, np.float64),
+        np.ones(len(points)),
+        np.ascontiguousarray(triangles, np.int32),
+        size,
+        size,
+        0.0,
+    )
+    return index, barycentric
+
+
 assert _cpu
 
 

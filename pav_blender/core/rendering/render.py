@@ -260,6 +260,24 @@ def render(
     return Picture(rgba.reshape(*shape, 4), depth.reshape(shape), evaluations)
 
 
+def trace_rays(
+    scene: Scene, rays: RayBatch, settings: RenderSettings | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Straight sRGB with alpha [R, 4] and depth along the cosine's axis [R] (inf if empty) of any
+    rays, on all threads."""
+    chosen = settings or RenderSettings()
+    rgba, depth = np.zeros((len(rays), 4), np.float32), np.full(len(rays), np.inf, np.float32)
+
+    def trace(start: int, stop: int) -> None:
+        with torch.inference_mode():
+            part = rays.pick(torch.arange(start, stop))
+            rgba[start:stop], depth[start:stop], _ = _trace(scene, part, chosen)
+
+    with torch.inference_mode(), torch_alone():
+        run_chunks(trace, len(rays), chosen.chunk)
+    return rgba, depth
+
+
 def _trace(
     scene: Scene, rays: RayBatch, settings: RenderSettings
 ) -> tuple[np.ndarray, np.ndarray, int]:
