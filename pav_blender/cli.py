@@ -22,6 +22,7 @@ VERBS = {
     "render": "render an avatar along a track to an image sequence",
     "bake": "a textured mesh of an avatar, for programs that cannot run its field",
     "export": "a collection in INSTA's or VHAP's layout, or as posed meshes",
+    "head": "a head file out of any Blender mesh with shape keys",
     "scene": "build a Blender scene of an avatar on a track",
     "bench": "measure speed against error: render, train, kernels, scale",
     "info": "what an avatar file holds",

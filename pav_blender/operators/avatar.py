@@ -67,6 +67,38 @@ class PAV_OT_import_track(bpy.types.Operator):
         return {"FINISHED"}
 
 
+class PAV_OT_save_head(bpy.types.Operator):
+    """Write the active mesh, its shape keys and its armature as a head file"""
+
+    bl_idname = "pav.save_head"
+    bl_label = "Save Head File"
+
+    filepath: bpy.props.StringProperty(subtype="FILE_PATH")  # type: ignore[valid-type]
+    filter_glob: bpy.props.StringProperty(  # type: ignore[valid-type]
+        default="*.npz", options={"HIDDEN"}
+    )
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        return context.active_object is not None and context.active_object.type == "MESH"
+
+    def invoke(self, context: Any, _event: Any) -> set[str]:
+        self.filepath = f"{context.active_object.name}.npz"
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    @reporting
+    def execute(self, context: Any) -> set[str]:
+        requirements.check()
+        from ..bridge.heads import head_from_object
+        from ..core.head import write_head
+
+        head = head_from_object(context.active_object)
+        write_head(Path(self.filepath), head)
+        self.report({"INFO"}, f"{self.filepath}: {len(head.expression_names)} expressions")
+        return {"FINISHED"}
+
+
 def find_head(context: Any) -> Any | None:
     """The active object if it is a head, else the head that the active object deforms or holds,
     else the scene's only head."""
@@ -93,5 +125,5 @@ def _select(context: Any, object_: Any) -> None:
     context.view_layer.objects.active = object_
 
 
-classes = (PAV_OT_add_head, PAV_OT_import_track)
+classes = (PAV_OT_add_head, PAV_OT_import_track, PAV_OT_save_head)
 register, unregister = bpy.utils.register_classes_factory(classes)

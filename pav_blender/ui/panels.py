@@ -25,6 +25,7 @@ class PAV_PT_avatar(_Sidebar, bpy.types.Panel):
         _draw_missing(layout)
         head = find_head(context)
         layout.operator("pav.add_head", icon="IMPORT")
+        layout.operator("pav.save_head", icon="EXPORT")
         active = context.active_object
         if head is None and active is not None and active.type == "MESH":
             head = active

@@ -63,8 +63,9 @@ def compare(
         truth, ours = over(field, BACKGROUND), over(mesh, BACKGROUND)
         head = field[..., 3] > 0.5
         both = head & (mesh[..., 3] > 0.99)
-        scores = [psnr(ours, truth, mask) for mask in (head, both, None)]
-        found.append(Likeness(yaw, pitch, *scores, field, mesh))
+        whole = psnr(ours, truth)
+        head_psnr, inside_psnr = (psnr(ours, truth, mask) for mask in (head, both))
+        found.append(Likeness(yaw, pitch, head_psnr, inside_psnr, whole, field, mesh))
         if progress:
             progress((done + 1) / len(VIEWS), step="compare")
     return found

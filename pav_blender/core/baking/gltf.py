@@ -39,8 +39,10 @@ def write_glb(path: Path | str, baked: Baked, name: str) -> None:
         visual=trimesh.visual.TextureVisuals(uv=baked.uvs, material=material),
         process=False,
     )
+    scene = trimesh.Scene()
+    scene.add_geometry(mesh, geom_name=name)
     content = trimesh.exchange.gltf.export_glb(
-        trimesh.Scene({name: mesh}), include_normals=True, tree_postprocessor=_unlit
+        scene, include_normals=True, tree_postprocessor=_unlit
     )
     with replacing(path) as temporary:
         temporary.write_bytes(content)

@@ -52,7 +52,9 @@ def surface(
         import fast_simplification
         from skimage.measure import marching_cubes
     except ImportError as error:
-        raise PavError(f"baking needs {error.name}: pip install {_PACKAGES[error.name]}") from error
+        raise PavError(
+            f"baking needs {error.name}: pip install scikit-image fast-simplification"
+        ) from error
     corner, held = _lattice(scene, spacing)
     places = np.argwhere(held)
     points = (corner + places * spacing).astype(np.float32)
@@ -63,10 +65,9 @@ def surface(
     grid = ndimage.gaussian_filter(grid, _BLUR) / np.maximum(
         ndimage.gaussian_filter(known, _BLUR), 1e-6
     )
-    known = known > 0
     if not (grid[known] < 0).any() or not (grid[known] > 0).any():
         raise InputError("the avatar has no opaque part in this appearance; nothing to bake")
-    vertices, faces, _, _ = marching_cubes(grid, 0.0, mask=known)
+    vertices, faces, _, _ = marching_cubes(grid, 0.0, mask=known > 0)
     vertices, faces = _large_pieces(vertices * spacing + corner, faces)
     vertices = _smoothed(vertices, faces)
     if len(faces) > triangles:
@@ -78,9 +79,6 @@ def surface(
         vertices = _settle(scene, vertices, faces)
     vertices = vertices + _RIM * vertex_normals(vertices, faces)
     return vertices.astype(np.float32), faces
-
-
-_PACKAGES = {"skimage": "scikit-image", "fast_simplification": "fast-simplification"}
 
 
 def _lattice(scene: Scene, spacing: float) -> tuple[np.ndarray, np.ndarray]:

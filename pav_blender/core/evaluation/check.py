@@ -67,9 +67,10 @@ def check(collection: Collection, *, progress: Report | None = None) -> Findings
 
 
 def _mesh_in_matte(collection: Collection, clip: Clip, row: int, rgba: np.ndarray) -> float:
-    """Part of the face's vertices in the picture that project into the matte."""
+    """Part of the face's vertices in the picture that project into the matte; of all, where the
+    head does not say what its face is."""
     vertices = collection.posed(clip, np.array([row]))[0]
-    face = vertices[collection.head.regions["face"]]
+    face = vertices[collection.head.regions.get("face", slice(None))]
     pixels, depth = camera_of(clip, row).project(face)
     at = np.floor(pixels).astype(int)
     inside = (depth > 0) & (at >= 0).all(1) & (at[:, 0] < clip.width) & (at[:, 1] < clip.height)

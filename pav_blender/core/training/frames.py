@@ -111,8 +111,11 @@ def load_frames(
 
 
 def _face_triangles(collection: Collection) -> np.ndarray:
-    """Triangles [T] whose depth is trusted: the face's skin, not eyes, lips or mouth."""
+    """Triangles [T] whose depth is trusted: the face's skin, not eyes, lips or mouth; none of a
+    head that does not say where its face is."""
     regions = collection.head.regions
+    if "face" not in regions:
+        return np.zeros(len(collection.head.triangles), bool)
     trusted = regions["face"].copy()
     for name in ("lips", "mouth_interior", "eyeballs", "teeth"):
         if name in regions:
