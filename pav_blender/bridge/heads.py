@@ -30,8 +30,8 @@ def head_from_object(
     """The head that a mesh object is, named after it.
 
     Shape keys become expressions (muted ones are left out). Bones whose vertex groups hold weights
-    become joints, `joints` renaming some (ours -> theirs: {"jaw": "DEF-jaw"}); vertices of no
-    bone go with the first. Vertex groups called `region.<name>` become regions, `regions` adding
+    become joints, `joints` renaming some (ours -> theirs: {"jaw": "DEF-jaw"}); where several bones
+    have no parent, or vertices no bone, a root is added that holds them. Vertex groups called `region.<name>` become regions, `regions` adding
     others (ours -> theirs). Without UVs xatlas makes an atlas.
 
     Raises InputError where the object is none that a head can be read from, and says why.
@@ -199,11 +199,14 @@ def _joints(
         every[:, groups[bone.name]] if bone.name in groups else np.zeros(len(every))
         for bone in kept
     ]
-    if parents.count(-1) != 1:  # one joint that everything hangs on
-        names, parents = ["root", *names], [-1, *(parent + 1 for parent in parents)]
-        places, columns = [matrix[:3, 3], *places], [np.zeros(len(every)), *columns]
-    weights = np.stack(columns, 1)
-    weights[weights.sum(1) <= 0, 0] = 1
+    weights = np.stack(columns, 1) if columns else np.zeros((len(every), 0))
+    loose = weights.sum(1) <= 0
+    if parents.count(-1) != 1 or (loose.any() and names[0] != "root"):
+        # one joint that everything hangs on, and that holds what no bone moves
+        names = ["base" if "root" in names else "root", *names]
+        parents, places = [-1, *(parent + 1 for parent in parents)], [matrix[:3, 3], *places]
+        weights = np.concatenate([np.zeros((len(every), 1)), weights], 1)
+    weights[loose, 0] = 1
     if len(set(names)) < len(names):
         raise InputError(f"armature {armature.name!r} gives two joints one name: {names}")
     return names, parents, np.stack(places), weights
