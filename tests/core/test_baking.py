@@ -1,9 +1,11 @@
 """A mesh baked from a field: where it lies, what is on it, and what the file holds."""
 
+import dataclasses
 import json
 
 import numpy as np
 import pytest
+import torch
 from scipy.spatial import cKDTree
 
 from pav_blender.cli import main
@@ -118,6 +120,16 @@ def test_cameras_look_where_they_should():
     assert left.origin[0] > middle[0] + 1
     above = camera_at(middle, 0, 0.5, 0.3, 100)
     assert above.origin[1] > middle[1] + 0.5
+
+
+def test_an_avatar_of_nothing_is_refused(toy_avatar):
+    scene = neutral_scene(toy_avatar, "plain")
+    bricks, cells = torch.full_like(scene.voxels.bricks, -1), scene.voxels.cells[:0]
+    empty = dataclasses.replace(
+        scene, voxels=dataclasses.replace(scene.voxels, bricks=bricks, cells=cells)
+    )
+    with pytest.raises(InputError, match="nothing to bake"):
+        bake(empty, texture=64, triangles=1000)
 
 
 def test_wrong_words_are_one_line(toy_avatar_path, tmp_path, capsys):

@@ -37,6 +37,7 @@ _OUTSIDE = 0.005  # metres before the surface where it is looked for again
 _SETTLING = 2
 _BLUR = 1.0  # spacings: strands and noise thinner than these become one surface
 _RIM = 0.0015  # metres: a soft outline shows further out than the same softness seen straight on
+_NOTHING = "the avatar has no opaque part in this appearance; there is nothing to bake"
 _SMOOTHING = 8  # steps; each shrinks and swells again (Taubin 1995)
 
 
@@ -56,18 +57,19 @@ def surface(
             f"baking needs {error.name}: pip install scikit-image fast-simplification"
         ) from error
     corner, held = _lattice(scene, spacing)
+    if not held.any():
+        raise InputError(_NOTHING)
     places = np.argwhere(held)
     points = (corner + places * spacing).astype(np.float32)
     distance, looks = _fuse(scene, points, _CUT * spacing, progress)
-    grid, known = np.zeros(held.shape, np.float32), np.zeros(held.shape, np.float32)
+    grid = np.zeros(held.shape, np.float32)
     # what no picture ever saw before the surface lies behind it: without this, holes
-    grid[held], known[held] = np.where(looks > 0, distance, -1), 1
-    grid = ndimage.gaussian_filter(grid, _BLUR) / np.maximum(
-        ndimage.gaussian_filter(known, _BLUR), 1e-6
-    )
-    if not (grid[known] < 0).any() or not (grid[known] > 0).any():
-        raise InputError("the avatar has no opaque part in this appearance; nothing to bake")
-    vertices, faces, _, _ = marching_cubes(grid, 0.0, mask=known > 0)
+    grid[held] = np.where(looks > 0, distance, -1)
+    share = ndimage.gaussian_filter(held.astype(np.float32), _BLUR)
+    grid = ndimage.gaussian_filter(grid, _BLUR) / np.maximum(share, 1e-6)
+    if not (grid[held] < 0).any() or not (grid[held] > 0).any():
+        raise InputError(_NOTHING)
+    vertices, faces, _, _ = marching_cubes(grid, 0.0, mask=held)
     vertices, faces = _large_pieces(vertices * spacing + corner, faces)
     vertices = _smoothed(vertices, faces)
     if len(faces) > triangles:
