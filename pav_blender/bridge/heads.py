@@ -31,8 +31,9 @@ def head_from_object(
 
     Shape keys become expressions (muted ones are left out). Bones whose vertex groups hold weights
     become joints, `joints` renaming some (ours -> theirs: {"jaw": "DEF-jaw"}); where several bones
-    have no parent, or vertices no bone, a root is added that holds them. Vertex groups called `region.<name>` become regions, `regions` adding
-    others (ours -> theirs). Without UVs xatlas makes an atlas.
+    have no parent, or vertices no bone, a root is added that holds them. Vertex groups called
+    `region.<name>` become regions, `regions` adding others (ours -> theirs). Without UVs xatlas
+    makes an atlas.
 
     Raises InputError where the object is none that a head can be read from, and says why.
     """

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -220,4 +221,16 @@ def test_wrong_words_are_one_line(toy_path, tmp_path, capsys):
     assert "takes one clip" in refused("export", toy_path, "--to", "abc", "--out", out)
     line = refused("export", f"{toy_path}:plain", "--to", "usd", "--out", tmp_path / "a.abc")
     assert ".usd" in line
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("words", [["export", "{toy}:plain", "--to", "abc"], ["head"]])
+def test_without_blender_the_message_says_so(words, toy_path, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "bpy", None)  # importing it raises ImportError
+    suffix = {"export": "abc", "head": "npz"}[words[0]]
+    words = [word.format(toy=toy_path) for word in words]
+    assert main([*words, "--out", str(tmp_path / f"a.{suffix}")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "blender" in line
+    assert "pip install bpy" in line
     assert list(tmp_path.iterdir()) == []
