@@ -16,6 +16,7 @@ from .axes import points_to_blender
 from .lens import from_intrinsics
 
 _SUFFIXES = {"abc": (".abc",), "usd": (".usd", ".usda", ".usdc", ".usdz")}
+_OPTIONS = {"abc": "alembic", "usd": "usd"}
 _LONGEST = 100_000  # frame numbers between the first and the last
 
 
@@ -40,6 +41,11 @@ def export_animated(
         raise InputError(
             f"--to {kind} needs Blender: `blender --command pav export ...`, or `pip install bpy`"
         ) from error
+    if not getattr(bpy.app.build_options, _OPTIONS[kind], True):
+        raise InputError(
+            f"--to {kind}: this Blender was built without {kind.upper()}, as some distributions' "
+            "are; use one from blender.org, or `pip install bpy`"
+        )
     from .scene import _rows
 
     rows = _rows(clip)

@@ -149,3 +149,26 @@ def test_disable_and_enable_again(blender):
     done = blender("-b", "--python-exit-code", "3", "--python", WORK / "probe.py")
     assert "probe done bl_ext.user_default.pav_blender" in done.stdout, done.stdout + done.stderr
     assert done.returncode == 0
+
+
+def test_the_open_files_head_becomes_a_head_file_and_a_clip_alembic(blender, files):
+    from pav_blender.core.head import builtin_head, read_head
+
+    head = WORK / "walk_head.npz"
+    done = blender("-b", files / "walk.blend", "--command", "pav", "head", "--out", head)
+    assert done.returncode == 0, done.stdout + done.stderr
+    found, built_in = read_head(ROOT / head), builtin_head()
+    assert found.expression_names == built_in.expression_names
+    assert found.joint_names == built_in.joint_names
+    np.testing.assert_array_equal(found.triangles, built_in.triangles)
+    # at rest, although the scene's first frame is not
+    np.testing.assert_allclose(found.template, built_in.template, atol=1e-5)
+    out = WORK / "walk.abc"
+    done = blender(
+        "--command", "pav", "export", f"{WORK / 'collection'}:walk", "--to", "abc", "--out", out
+    )
+    if "built without ABC" in done.stderr:  # Debian's is
+        assert done.returncode == 2
+        return
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert (ROOT / out).stat().st_size > 100_000
