@@ -7,6 +7,7 @@ face's: it looks along -y.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ import numpy as np
 from ..core.errors import InputError
 from ..core.head import HeadModel, head_from_shape_keys
 from .axes import TO_CORE
-from .rig import REGION_PREFIX, find_armature
+from .rig import CORRECTIVE_PREFIX, REGION_PREFIX, find_armature
 
 _SMALLEST, _LARGEST = 0.08, 2.0  # metres from end to end: life size, with or without shoulders
 _MEMBER = 0.5  # weight from which a vertex is in a region
@@ -50,10 +51,12 @@ def head_from_object(
         )
     names, parents, places, weights = _joints(object_, dict(joints or {}))
     triangles, uvs, uv_triangles = _triangles(mesh)
-    return head_from_shape_keys(
+    moved = {name: offset @ matrix[:3, :3].T for name, offset in keys.items()}
+    correctives = [moved.pop(name) for name in _correctives(moved, len(names))]
+    head = head_from_shape_keys(
         vertices,
         triangles,
-        {name: vertices + offset @ matrix[:3, :3].T for name, offset in keys.items()},
+        {name: vertices + offset for name, offset in moved.items()},
         uvs=uvs,
         uv_triangles=uv_triangles,
         joint_names=names,
@@ -64,6 +67,14 @@ def head_from_object(
         name=object_.name,
         origin=f"Blender object {object_.name!r}",
     )
+    return replace(head, pose_basis=np.array(correctives)) if correctives else head
+
+
+def _correctives(keys: Mapping[str, Any], joints: int) -> list[str]:
+    """The keys that a rig of ours drives by its bones, in order; none where they are not all
+    there."""
+    names = [f"{CORRECTIVE_PREFIX}{index:03d}" for index in range(9 * (joints - 1))]
+    return names if all(name in keys for name in names) else []
 
 
 def open_object(path: Path | None, name: str | None) -> Any:
