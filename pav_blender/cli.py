@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import keyword
 import os
 import sys
 from collections.abc import Sequence
@@ -17,6 +18,7 @@ VERBS = {
     "demo": "the main job on the built-in person: collection, avatar, Blender scene, pictures",
     "studio": "render a collection of clips of a synthetic person with Cycles",
     "track": "make a collection from videos of one person",
+    "import": "make a collection of what other trackers and avatar systems wrote",
     "check": "validate and summarise a collection, with an overlay picture",
     "train": "train an avatar on a collection",
     "render": "render an avatar along a track to an image sequence",
@@ -71,7 +73,8 @@ def run() -> None:
 
 
 def _run(verb: str, argv: list[str]) -> int:
-    module = importlib.import_module(f".verbs.{verb}", __package__)
+    name = f"{verb}_" if keyword.iskeyword(verb) else verb
+    module = importlib.import_module(f".verbs.{name}", __package__)
     parser = _Parser(
         prog=f"pav {verb}",
         description=module.SUMMARY,

@@ -64,7 +64,8 @@ class Clip:
 
 @dataclass(eq=False)
 class Collection:
-    """Clips of one person: `betas` [B] is the identity they share."""
+    """Clips of one person: `betas` [B] is the identity they share, and so is `head_offset` [V, 3],
+    metres, which `head` has in its template already (None: none)."""
 
     path: Path
     head_name: str
@@ -72,6 +73,14 @@ class Collection:
     betas: np.ndarray
     clips: list[Clip]
     extra: dict = field(default_factory=dict)
+    head_offset: np.ndarray | None = None
+
+    def head_with(self, offset: np.ndarray | None) -> HeadModel:
+        """The head model with another person's offset [V, 3] in place of this collection's."""
+        zero = np.zeros_like(self.head.template)
+        own = zero if self.head_offset is None else self.head_offset
+        change = (zero if offset is None else offset) - own
+        return self.head.with_offset(change) if change.any() else self.head
 
     @property
     def appearances(self) -> list[str]:

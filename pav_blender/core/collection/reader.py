@@ -11,7 +11,7 @@ import numpy as np
 from ..errors import InputError
 from ..head import HeadModel, load_head
 from .model import FORMAT, SPLITS, VERSION, Clip, Collection
-from .writer import check_name
+from .writer import OFFSET_FILE, check_name
 
 _LARGEST_SIDE = 16384
 
@@ -39,6 +39,8 @@ def read_collection(path: Path | str) -> Collection:
         )
     try:
         head_name = str(meta["head"]["name"])
+        fingerprint = str(meta["head"].get("fingerprint", ""))
+        has_offset = bool(meta["head"].get("offset", False))
         betas = np.asarray(meta["head"]["betas"], np.float32).reshape(-1)
         entries = [
             (
@@ -55,14 +57,33 @@ def read_collection(path: Path | str) -> Collection:
         raise InputError(f"{meta_path}: the collection has no clips")
     if len({entry[0] for entry in entries}) < len(entries):
         raise InputError(f"{meta_path}: two clips have the same name")
-    head = load_head(head_name)
+    try:
+        head = load_head(head_name, fingerprint)
+    except InputError as error:
+        raise InputError(f"{meta_path}: {error}") from error
     if len(betas) > len(head.shape_basis) or not np.isfinite(betas).all():
         raise InputError(
             f"{meta_path}: {len(betas)} identity coefficients; head {head_name!r} takes "
             f"{len(head.shape_basis)} finite ones at most"
         )
+    offset = _read_offset(path, head) if has_offset else None
+    if offset is not None:
+        head = head.with_offset(offset)
     clips = [_read_clip(path, head, *entry) for entry in entries]
-    return Collection(path, head_name, head, betas, clips, dict(meta.get("extra") or {}))
+    extra = dict(meta.get("extra") or {})
+    return Collection(path, head_name, head, betas, clips, extra, offset)
+
+
+def _read_offset(root: Path, head: HeadModel) -> np.ndarray:
+    path = root / OFFSET_FILE
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            offset = np.asarray(stored["offset"], np.float32)
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(f"{path}: missing or damaged ({error})") from error
+    if offset.shape != head.template.shape or not np.isfinite(offset).all():
+        raise InputError(f"{path}: 'offset' must hold {head.template.shape} finite numbers")
+    return offset
 
 
 def _read_clip(

@@ -16,6 +16,7 @@ from ..files import replacing, write_text
 from ..images import write_gray, write_rgba
 from .model import FORMAT, SPLITS, VERSION, Clip
 
+OFFSET_FILE = "head_offset.npz"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 
 
@@ -34,6 +35,9 @@ class CollectionWriter:
 
     An error inside the block removes what was written. Raises InputError where `path` exists,
     unless `overwrite` says to replace a collection (and nothing but a collection).
+
+    fingerprint: the head's, where it is not found by its name alone; offset [V, 3] metres: what the
+    person has beside the betas.
     """
 
     def __init__(
@@ -42,6 +46,8 @@ class CollectionWriter:
         head_name: str,
         betas: np.ndarray,
         *,
+        fingerprint: str = "",
+        offset: np.ndarray | None = None,
         extra: dict | None = None,
         overwrite: bool = False,
     ) -> None:
@@ -49,10 +55,16 @@ class CollectionWriter:
         if self.path.exists() and not (overwrite and (self.path / "collection.json").is_file()):
             what = "is not a collection" if overwrite else "exists already"
             raise InputError(f"{self.path}: {what}; choose another folder or remove it")
+        head: dict = {"name": head_name, "betas": [float(b) for b in np.ravel(betas)]}
+        if fingerprint:
+            head["fingerprint"] = fingerprint
+        if offset is not None:
+            head["offset"] = True
+        self._offset = offset
         self._meta: dict = {
             "format": FORMAT,
             "version": VERSION,
-            "head": {"name": head_name, "betas": [float(b) for b in np.ravel(betas)]},
+            "head": head,
             "clips": [],
             "extra": extra or {},
         }
@@ -77,6 +89,8 @@ class CollectionWriter:
         if kind is not None:
             shutil.rmtree(self.root, ignore_errors=True)
             return
+        if self._offset is not None:
+            np.savez_compressed(self.root / OFFSET_FILE, offset=np.asarray(self._offset, "f4"))
         write_text(self.root / "collection.json", json.dumps(self._meta, indent=1) + "\n")
         if self.path.exists():
             shutil.rmtree(self.path)

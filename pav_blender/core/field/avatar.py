@@ -51,6 +51,7 @@ class Avatar:
     betas: np.ndarray
     expression_names: tuple[str, ...]
     record: dict[str, Any] = field(default_factory=dict)
+    head_offset: np.ndarray | None = None  # [V, 3] metres, the person's own beside the betas
 
     @classmethod
     def create(
@@ -121,6 +122,8 @@ class Avatar:
             "space.occupied": np.packbits(self.occupied.reshape(len(self.appearances), -1), 1),
             "head.betas": np.asarray(self.betas, np.float32),
         }
+        if self.head_offset is not None:
+            arrays["head.offset"] = np.asarray(self.head_offset, np.float32)
         # copies: safetensors refuses tensors that share memory, as a mesh and its UVs may
         tensors |= {k: torch.from_numpy(np.array(v, order="C")) for k, v in arrays.items()}
         header = {
@@ -154,13 +157,8 @@ class Avatar:
 
 def head_of(avatar: Avatar) -> HeadModel:
     """The head model that an avatar was trained on; InputError where it is another by now."""
-    head = load_head(avatar.head_name)
-    if head.fingerprint != avatar.head_fingerprint:
-        raise InputError(
-            f"made with another version of the head {avatar.head_name!r}; train it again with "
-            "this one"
-        )
-    return head
+    head = load_head(avatar.head_name, avatar.head_fingerprint)
+    return head if avatar.head_offset is None else head.with_offset(avatar.head_offset)
 
 
 def read_header(path: Path | str) -> dict[str, Any]:
@@ -243,11 +241,18 @@ def _assemble(header: dict[str, Any], tensors: dict[str, torch.Tensor]) -> Avata
         head_name=str(header["head"]["name"]),
         head_fingerprint=str(header["head"]["fingerprint"]),
         betas=tensors["head.betas"].numpy(),
+        head_offset=_offset(tensors.get("head.offset"), len(vertices)),
         record=dict(header["record"]),
     )
     state = {k[6:]: v for k, v in tensors.items() if k.startswith("field.")}
     avatar.field.load_state_dict(state)
     return avatar
+
+
+def _offset(tensor: torch.Tensor | None, vertices: int) -> np.ndarray | None:
+    if tensor is not None and tuple(tensor.shape) != (vertices, 3):
+        raise InputError(f"the head's offset is {tuple(tensor.shape)}; {(vertices, 3)} expected")
+    return None if tensor is None else tensor.numpy()
 
 
 def _check_indices(name: str, array: np.ndarray, limit: int) -> None:

@@ -1,7 +1,8 @@
 """Head models: the built-in one, files, any mesh with shape keys; posing and skinning."""
 
-from .builtin import BUILTIN, builtin_head, load_head
+from .builtin import BUILTIN, builtin_head
 from .files import read_head, write_head
+from .library import load_head, remember_head
 from .model import HeadModel
 from .shape_keys import head_from_shape_keys
 
@@ -12,5 +13,6 @@ __all__ = [
     "head_from_shape_keys",
     "load_head",
     "read_head",
+    "remember_head",
     "write_head",
 ]

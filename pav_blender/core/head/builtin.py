@@ -16,10 +16,3 @@ BUILTIN_PATH = Path(__file__).parent / "data" / "builtin_head.npz"
 def builtin_head() -> HeadModel:
     """The built-in head; read once."""
     return read_head(BUILTIN_PATH)
-
-
-def load_head(name_or_path: str | Path) -> HeadModel:
-    """The head called "builtin", or the one in a head file."""
-    if str(name_or_path) == BUILTIN:
-        return builtin_head()
-    return read_head(name_or_path)

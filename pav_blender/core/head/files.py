@@ -23,9 +23,9 @@ VERSION = 1
 _STRINGS = ("name", "origin")
 _NAMES = ("expression_names", "joint_names")
 _QUANTISED = ("shape_basis", "expression_basis", "pose_basis")
-_ARRAYS = tuple(
-    field.name for field in fields(HeadModel) if field.name not in (*_STRINGS, *_NAMES, "regions")
-)
+_FLAG = "joints_follow_expression"  # absent from older files, where it is false
+_OTHERS = (*_STRINGS, *_NAMES, _FLAG, "regions")
+_ARRAYS = tuple(field.name for field in fields(HeadModel) if field.name not in _OTHERS)
 _REGION = "region/"
 
 
@@ -44,6 +44,7 @@ def write_head(path: str | Path, head: HeadModel, *, step: float | None = None) 
         **{name: np.array(getattr(head, name)) for name in _STRINGS},
         **{name: np.array(getattr(head, name), dtype=np.str_) for name in _NAMES},
         **{name: getattr(head, name) for name in _ARRAYS},
+        _FLAG: np.array(head.joints_follow_expression),
         **{_REGION + name: mask for name, mask in head.regions.items()},
     }
     if step is not None:
@@ -99,6 +100,7 @@ def _assemble(path: Path, content: dict[str, np.ndarray]) -> HeadModel:
     values: dict[str, Any] = {name: content[name] for name in _ARRAYS}
     values |= {name: str(content[name]) for name in _STRINGS}
     values |= {name: tuple(content[name].ravel().tolist()) for name in _NAMES}
+    values[_FLAG] = bool(np.any(content.get(_FLAG, False)))
     values["regions"] = {
         name.removeprefix(_REGION): mask
         for name, mask in content.items()

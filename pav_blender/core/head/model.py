@@ -12,6 +12,7 @@ turn of the neck turns the face to the person's left.
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import math
 from dataclasses import dataclass
@@ -53,6 +54,8 @@ class HeadModel:
     landmark_triangles: np.ndarray  # [L] int32, L = 478 (MediaPipe's order) or 0
     landmark_barycentrics: np.ndarray  # [L,3] float32
     origin: str
+    # FLAME reads its joints off the expression too; others off the identity alone
+    joints_follow_expression: bool = False
 
     def __post_init__(self) -> None:
         for field in _FLOATS:
@@ -72,11 +75,12 @@ class HeadModel:
     def vertex_count(self) -> int:
         return len(self.template)
 
-    def pose(self, betas, expression, pose, translation) -> torch.Tensor:
+    def pose(self, betas, expression, pose, translation, offset=None) -> torch.Tensor:
         """Vertices of posed heads, differentiable in every argument.
 
         betas: [B] or [F,B]; expression: [F,E]; pose: [F,J,3] axis-angle, radians; translation:
-        [F,3], metres. Arrays or tensors; shorter betas and expressions use the leading components.
+        [F,3], metres; offset: [V,3] or [F,V,3], metres, added to the template. Arrays or tensors;
+        shorter betas and expressions use the leading components.
         Returns [F,V,3] on the device of ``pose``; float64 where any argument is a float64 tensor,
         else float32. Raises :class:`InputError` for shapes that do not fit.
         """
@@ -88,7 +92,26 @@ class HeadModel:
             _tensor(argument, device, dtype) for argument in arguments
         )
         self._check_parameters(betas.shape, expression.shape, pose.shape, translation.shape)
-        return pose_vertices(self._tensors(device, dtype), betas, expression, pose, translation)
+        tensors = self._tensors(device, dtype)
+        if offset is not None:
+            tensors = {**tensors, "template": tensors["template"] + _tensor(offset, device, dtype)}
+        return pose_vertices(tensors, betas, expression, pose, translation)
+
+    def with_offset(self, offset: np.ndarray) -> HeadModel:
+        """The head of one person: `offset` [V,3], metres, is added to the template.
+
+        It keeps the fingerprint of the model it came from: an offset is part of an identity, as
+        betas are, and what moves the one moves the other.
+        """
+        offset = np.asarray(offset, np.float32)
+        if offset.shape != self.template.shape or not np.isfinite(offset).all():
+            raise InputError(
+                f"an offset of shape {list(offset.shape)}; head '{self.name}' takes "
+                f"{list(self.template.shape)} finite numbers"
+            )
+        person = dataclasses.replace(self, template=self.template + offset)
+        person.__dict__["fingerprint"] = self.fingerprint
+        return person
 
     def shaped(self, betas) -> np.ndarray:
         """The neutral head of an identity: betas [B] -> [V,3] float32."""
@@ -141,8 +164,15 @@ class HeadModel:
             tensors = {
                 field: torch.tensor(getattr(self, field)).to(device, dtype) for field in _POSED
             }
+            tensors["joint_expression"] = self._joint_expression(tensors)
             self._tensor_cache[key] = {**tensors, "joint_parents": self.joint_parents.tolist()}
         return self._tensor_cache[key]
+
+    def _joint_expression(self, tensors: dict[str, torch.Tensor]) -> torch.Tensor:
+        """How far each expression moves the joints, [E,J,3]; [0,J,3] where none does."""
+        basis = tensors["expression_basis"]
+        basis = basis if self.joints_follow_expression else basis[:0]
+        return tensors["joint_regressor"] @ basis
 
     def _check_parameters(self, betas, expression, pose, translation) -> None:
         frames = pose[0] if len(pose) == 3 else None

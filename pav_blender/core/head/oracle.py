@@ -29,6 +29,8 @@ def pose(head: HeadModel, betas, expression, pose, translation) -> np.ndarray:
         np.asarray(expression, np.float64), head.expression_basis, strict=False
     ):
         vertices += value * direction.astype(np.float64)
+    if head.joints_follow_expression:
+        joints = head.joint_regressor.astype(np.float64) @ vertices
     rotations = [rotation_matrix(r) for r in pose]
     if len(head.pose_basis):
         features = np.concatenate([(r - np.eye(3)).ravel() for r in rotations[1:]])

@@ -43,13 +43,16 @@ def pose_vertices(
 ) -> torch.Tensor:
     """Skinned vertices [F,V,3].
 
-    head: the model's arrays as tensors (``template``, bases, ``joint_regressor``,
-    ``skinning_weights``) and ``joint_parents`` as a list. The other arguments are those of
-    :meth:`pav_blender.core.head.model.HeadModel.pose`.
+    head: the model's arrays as tensors (``template``, [V,3] or [F,V,3], bases,
+    ``joint_regressor``, ``skinning_weights``, ``joint_expression``) and ``joint_parents`` as a
+    list. The other arguments are those of :meth:`pav_blender.core.head.model.HeadModel.pose`.
     """
     frames, joint_count = pose.shape[:2]
     shaped = head["template"] + _blend(betas, head["shape_basis"])
-    joints = (head["joint_regressor"] @ shaped).expand(frames, joint_count, 3)
+    joints = head["joint_regressor"] @ shaped
+    if len(head["joint_expression"]):
+        joints = joints + _blend(expression, head["joint_expression"])
+    joints = joints.expand(frames, joint_count, 3)
     rotations = rotation_matrices(pose)
     vertices = shaped + _blend(expression, head["expression_basis"])
     if len(head["pose_basis"]):

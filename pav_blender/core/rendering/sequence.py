@@ -59,6 +59,21 @@ def check_head(avatar: Avatar, collection: Collection) -> None:
         )
 
 
+def posed_avatar(
+    avatar: Avatar, collection: Collection, clip: Clip, rows: np.ndarray
+) -> np.ndarray:
+    """The avatar's mesh moved as in rows of a clip, [len(rows), V, 3] float32 metres.
+
+    The avatar keeps its own identity, so that another person's track drives without reshaping it;
+    what a clip's own vertices say beyond its parameters is added.
+    """
+    moved = clip.expression[rows], clip.pose[rows], clip.translation[rows]
+    posed = collection.head_with(avatar.head_offset).pose(avatar.betas, *moved).numpy()
+    if clip.vertices is not None:
+        posed += clip.vertices[rows] - collection.head.pose(collection.betas, *moved).numpy()
+    return posed
+
+
 def render_track(
     avatar_path: Path | str,
     track: str,
@@ -91,9 +106,7 @@ def render_track(
     check_pattern(out, several=len(rows) > 1, appearances=len(names), depth=depth)
     if size is not None and not 1 <= size <= 16384:
         raise InputError(f"--size {size}: from 1 to 16384")
-    # the avatar's own identity, so that another person's track drives without reshaping it
-    head = collection.head
-    posed = head.pose(avatar.betas, clip.expression[rows], clip.pose[rows], clip.translation[rows])
+    posed = posed_avatar(avatar, collection, clip, rows)
     written = []
     total = len(rows) * len(names)
     for name in names:
@@ -108,7 +121,7 @@ def render_track(
                 )
             picture = render(
                 avatar,
-                posed[at].numpy(),
+                posed[at],
                 camera,
                 name,
                 settings,

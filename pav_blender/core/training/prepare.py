@@ -66,6 +66,7 @@ def new_avatar(collection: Collection, frames: list[Frame], config: Config) -> A
         head_name=collection.head_name,
         head_fingerprint=head.fingerprint,
         betas=collection.betas,
+        head_offset=collection.head_offset,
         record={
             "frames": {
                 name: sum(f.appearance == index for f in frames)

@@ -1,0 +1,157 @@
+"""Head parameters of meshes whose tool wrote the mesh alone: every vertex corresponds."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+
+from ...head import HeadModel
+from ...head.flame import EYELIDS
+from ...head.model import CANONICAL_JAW_DEGREES
+from ...head.skinning import pose_vertices
+
+JAW, EYES = 2, (3, 4)
+_STEPS = 6
+_DIFFERENCE = 1e-5
+_CHUNK = 256
+_SAMPLES = 150  # vertices a part
+
+
+def canonical_pose() -> np.ndarray:
+    """The jaw open by 12 degrees: [1, 5, 3]."""
+    pose = np.zeros((1, 5, 3))
+    pose[0, JAW, 0] = math.radians(CANONICAL_JAW_DEGREES)
+    return pose
+
+
+def fit_shape(
+    head: HeadModel, vertices: np.ndarray, expression: np.ndarray, pose: np.ndarray
+) -> np.ndarray:
+    """Betas [B] that best explain posed meshes [K, V, 3], given the rest.
+
+    A posed mesh is affine in the betas, so that this is one linear least-squares problem.
+    """
+    count = len(head.shape_basis)
+    still = np.zeros((count + 1, 3))
+    betas = np.concatenate([np.zeros((1, count)), np.eye(count)])
+    normal, right = np.zeros((count, count)), np.zeros(count)
+    for mesh, values, turns in zip(vertices, expression, pose, strict=True):
+        posed = head.pose(
+            torch.tensor(betas),
+            np.repeat(values[None], count + 1, 0),
+            np.repeat(turns[None], count + 1, 0),
+            still,
+        ).numpy()
+        columns = (posed[1:] - posed[0]).reshape(count, -1)
+        normal += columns @ columns.T
+        right += columns @ (mesh - posed[0]).reshape(-1)
+    normal[np.diag_indices(count)] += 1e-9 * max(np.trace(normal) / count, 1e-12)
+    return np.linalg.solve(normal, right)
+
+
+def fit_pose(
+    head: HeadModel, betas: np.ndarray, expression: np.ndarray, vertices: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Jaw and eyes (and eyelids, where the head has them) of meshes [F, V, 3] of a still head.
+
+    expression [F, E]. Returns pose [F, 5, 3] and expression [F, E] with the eyelids filled in.
+    By Gauss-Newton on some hundreds of vertices.
+    """
+    lids = [head.expression_names.index(n) for n in EYELIDS if n in head.expression_names]
+    chosen = _chosen(head, lids)
+    small = _reduced(head, betas, chosen)
+    pose = np.zeros((len(vertices), len(head.joint_names), 3))
+    filled = np.array(expression, np.float64)
+    for start in range(0, len(vertices), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        pose[part], filled[part] = _fit_chunk(
+            small, filled[part], vertices[part][:, chosen].astype(np.float64), lids
+        )
+    return pose, filled
+
+
+def _chosen(head: HeadModel, lids: list[int]) -> np.ndarray:
+    weights = head.skinning_weights
+    parts = [np.flatnonzero(weights[:, joint] > 0.3) for joint in (JAW, *EYES)]
+    parts += [np.flatnonzero(np.abs(head.expression_basis[lid]).max(1) > 1e-3) for lid in lids]
+    spread = [part[:: max(1, -(-len(part) // _SAMPLES))] for part in parts]
+    return np.unique(np.concatenate(spread)) if any(len(p) for p in parts) else np.arange(50)
+
+
+def _reduced(head: HeadModel, betas: np.ndarray, chosen: np.ndarray) -> dict:
+    """The head of an identity, for `pose_vertices`, with few vertices; the joints follow them as
+    vertices of their own, from which they are read."""
+    whole = head._tensors(torch.device("cpu"), torch.float64)
+    shaped = torch.tensor(head.shaped(betas), dtype=torch.float64)
+    joints = whole["joint_regressor"] @ shaped
+    count = len(joints)
+    index = torch.from_numpy(chosen)
+    moves = whole["joint_expression"]
+    if not len(moves):
+        moves = torch.zeros(len(head.expression_names), count, 3, dtype=torch.float64)
+    basis = torch.cat([whole["expression_basis"][:, index], moves], 1)
+    correctives = whole["pose_basis"][:, index]
+    correctives = torch.cat([correctives, correctives.new_zeros(len(correctives), count, 3)], 1)
+    weights = whole["skinning_weights"][index]
+    anchors = torch.eye(1, count, dtype=torch.float64).repeat(count, 1)
+    regressor = torch.cat(
+        [torch.zeros(count, len(chosen), dtype=torch.float64), torch.eye(count).double()], 1
+    )
+    return {
+        "template": torch.cat([shaped[index], joints]),
+        "shape_basis": torch.zeros(0, len(chosen) + count, 3, dtype=torch.float64),
+        "expression_basis": basis,
+        "pose_basis": correctives,
+        "skinning_weights": torch.cat([weights, anchors]),
+        "joint_regressor": regressor,
+        "joint_expression": basis[:0, :count],  # the joints' own vertices move already
+        "joint_parents": whole["joint_parents"],
+        "count": len(chosen),
+    }
+
+
+def _fit_chunk(
+    small: dict, expression: np.ndarray, goals: np.ndarray, lids: list[int]
+) -> tuple[np.ndarray, np.ndarray]:
+    frames, joints = len(goals), len(small["joint_parents"])
+    unknowns = 9 + len(lids)
+    values = np.zeros((frames, unknowns))
+    basis = small["expression_basis"]
+    base = torch.tensor(expression)
+    base[:, lids] = 0
+    shaped = small["template"] + torch.einsum("fe,evc->fvc", base, basis)
+    # the joints are read off vertices that hold all of the expression but the eyelids
+    lid_basis = basis[lids]
+    lid_joints = lid_basis[:, small["count"] :]
+    rest = {**small, "expression_basis": lid_basis, "joint_expression": lid_joints}
+    target = torch.tensor(goals)
+
+    def posed(at: np.ndarray) -> torch.Tensor:
+        pose = torch.zeros(frames, joints, 3, dtype=torch.float64)
+        pose[:, [JAW, *EYES]] = torch.tensor(at[:, :9].reshape(frames, 3, 3))
+        lid = torch.tensor(at[:, 9:])
+        still = torch.zeros(frames, 3, dtype=torch.float64)
+        empty = torch.zeros(0, dtype=torch.float64)
+        made = pose_vertices({**rest, "template": shaped}, empty, lid, pose, still)
+        return made[:, : small["count"]]
+
+    for _ in range(_STEPS):
+        now = posed(values)
+        left = (target - now).reshape(frames, -1)
+        columns = []
+        for unknown in range(unknowns):
+            moved = values.copy()
+            moved[:, unknown] += _DIFFERENCE
+            columns.append((posed(moved) - now).reshape(frames, -1) / _DIFFERENCE)
+        jacobian = torch.stack(columns, 1)  # [F, unknowns, 3 K]
+        normal = jacobian @ jacobian.transpose(1, 2)
+        normal += 1e-9 * torch.eye(unknowns, dtype=torch.float64)
+        step = torch.linalg.solve(normal, (jacobian @ left[..., None])[..., 0])
+        values += step.numpy()
+    pose = np.zeros((frames, joints, 3))
+    pose[:, [JAW, *EYES]] = values[:, :9].reshape(frames, 3, 3)
+    filled = expression.copy()
+    filled[:, lids] = values[:, 9:]
+    return pose, filled

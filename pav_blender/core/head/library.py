@@ -1,0 +1,107 @@
+"""Finding a head model: by name, by file, or by the fingerprint of one used before.
+
+Avatars and collections name a head and its fingerprint, never hold one. Where its files lie on
+this machine is remembered in the user's preferences.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import fields
+from functools import lru_cache
+from pathlib import Path
+
+from .. import preferences
+from ..errors import InputError
+from .builtin import BUILTIN, builtin_head
+from .files import read_head
+from .flame import FlameFiles, find_flame, looks_like_flame, read_flame
+from .model import HeadModel
+
+_SECTION = "heads"
+
+
+def load_head(
+    name_or_path: str | Path, fingerprint: str = "", *, flame_version: str = ""
+) -> HeadModel:
+    """The head called "builtin", one remembered by `fingerprint`, or the one in a file.
+
+    A file is a head file of ours, or FLAME's (.pkl, a converted .npz, or a folder that holds one);
+    flame_version says which FLAME where its name does not. Raises InputError where the head is not
+    found, or the one found has another fingerprint.
+    """
+    if str(name_or_path) == BUILTIN:
+        head = builtin_head()
+    elif fingerprint in (known := preferences.read(_SECTION)):
+        head = _remembered(name_or_path, known[fingerprint])
+    elif fingerprint and not Path(name_or_path).exists():
+        raise InputError(
+            f"the head {str(name_or_path)!r} (fingerprint {fingerprint[:12]}) is not known on this "
+            "machine; name its file once: pav import --head FILE"
+        )
+    else:
+        head = _read(Path(name_or_path), flame_version)[0]
+    if fingerprint and head.fingerprint != fingerprint:
+        raise InputError(
+            f"the head {str(name_or_path)!r} found here has the fingerprint "
+            f"{head.fingerprint[:12]}, another one than {fingerprint[:12]} that is asked for; "
+            "its files were changed: name the right ones once with pav import --head FILE"
+        )
+    return head
+
+
+def remember_head(path: str | Path, *, flame_version: str = "") -> HeadModel:
+    """Reads a head file and remembers where it lies, under its fingerprint."""
+    if str(path) == BUILTIN:
+        return builtin_head()
+    head, entry = _read(Path(path), flame_version)
+    known = preferences.read(_SECTION)
+    if known.get(head.fingerprint) != entry:
+        preferences.write(_SECTION, {**known, head.fingerprint: entry})
+    return head
+
+
+def _read(path: Path, flame_version: str) -> tuple[HeadModel, dict[str, str]]:
+    if not path.exists():
+        raise InputError(f"{path}: no such head file")
+    path = path.absolute()
+    if not looks_like_flame(path):
+        return read_head(path), {"head": str(path)}
+    files = find_flame(path, flame_version)
+    head = _flame(files, _stamps(files))
+    entry = {"version": head.name.removeprefix("FLAME ")}
+    return head, entry | {
+        f.name: str(getattr(files, f.name))
+        for f in fields(files)
+        if f.name != "version" and getattr(files, f.name)
+    }
+
+
+def _remembered(name: str | Path, entry: dict) -> HeadModel:
+    entry = {str(k): str(v) for k, v in entry.items()} if isinstance(entry, dict) else {}
+    missing = [
+        path for part, path in entry.items() if part != "version" and not os.path.isfile(path)
+    ]
+    if missing or not ("head" in entry or "model" in entry):
+        gone = missing[0] if missing else "its file"
+        raise InputError(
+            f"the head {str(name)!r}: {gone} is no longer there; name the head's file again: "
+            "pav import --head FILE"
+        )
+    if "head" in entry:
+        return read_head(entry["head"])
+    known = {f.name for f in fields(FlameFiles)} - {"version"}
+    parts = {part: Path(path) for part, path in entry.items() if part in known}
+    files = FlameFiles(version=entry.get("version", ""), **parts)  # type: ignore[arg-type]
+    return _flame(files, _stamps(files))
+
+
+def _stamps(files: FlameFiles) -> tuple[int, ...]:
+    paths = [getattr(files, f.name) for f in fields(files) if f.name != "version"]
+    return tuple(p.stat().st_mtime_ns for p in paths if p)
+
+
+@lru_cache(maxsize=2)
+def _flame(files: FlameFiles, stamps: tuple[int, ...]) -> HeadModel:
+    """Read once a process, as long as the files stay as they are."""
+    return read_flame(files)
