@@ -59,7 +59,7 @@ def pose_vertices(
         identity = torch.eye(3, dtype=pose.dtype, device=pose.device)
         features = (rotations[:, 1:] - identity).reshape(frames, -1)
         vertices = vertices + _blend(features, head["pose_basis"])
-    turns, shifts = _joint_motions(rotations, joints, head["joint_parents"])
+    turns, shifts = joint_motions(rotations, joints, head["joint_parents"])
     motions = torch.cat((turns.reshape(frames, joint_count, 9), shifts), -1)
     blended = head["skinning_weights"] @ motions  # [F,V,12]
     blended_turns = blended[..., :9].reshape(frames, -1, 3, 3)
@@ -74,7 +74,7 @@ def _blend(coefficients: torch.Tensor, basis: torch.Tensor) -> torch.Tensor:
     return flat.reshape(*coefficients.shape[:-1], *basis.shape[1:])
 
 
-def _joint_motions(
+def joint_motions(
     rotations: torch.Tensor, joints: torch.Tensor, parents: list[int]
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Rest-to-posed motions x -> turn x + shift: turns [F,J,3,3] and shifts [F,J,3]."""

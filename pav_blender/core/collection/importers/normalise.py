@@ -25,6 +25,7 @@ SHAPES = ("mean", "first")
 EXPLAINED = 1e-4  # metres: parameters that pose a mesh as near as this stand for it
 _CHUNK = 64
 _FIT_FRAMES = 8
+_ROUNDS = 6
 
 
 @dataclass(eq=False)
@@ -123,7 +124,7 @@ def _own_shape(clip: ParsedClip, head: HeadModel) -> np.ndarray:
     rows = np.unique(np.linspace(0, len(clip) - 1, _FIT_FRAMES).round().astype(int))
     expression = _expression(clip, head)[rows]
     pose = np.zeros((len(rows), 5, 3))
-    for _ in range(3):
+    for _ in range(_ROUNDS):
         betas = fit_shape(head, clip.vertices[rows], expression, pose)
         pose, expression = fit_pose(head, betas, expression, clip.vertices[rows])
     return fit_shape(head, clip.vertices[rows], expression, pose).astype(np.float32)
@@ -156,6 +157,9 @@ def _normal(
         notes.append("identity, jaw and eyes were fitted to the meshes")
     elif vertices is not None:
         pose = _eyes_in_order(head, betas, expression, pose, vertices, notes)
+    has_lids = EYELIDS[0] in head.expression_names
+    if vertices is None and clip.eyelids is not None and has_lids:
+        vertices = _lids_last(head, betas, expression, pose)
     still = fixed_head(head, betas, expression, pose, clip)
     translation = np.zeros((len(clip), 3))
     pose[:, 0] = 0
@@ -163,7 +167,6 @@ def _normal(
         vertices = _unmoved(vertices, still)
     elif clip.moving_offset is not None:
         vertices = _posed(head, betas, expression, pose, clip.moving_offset)
-    has_lids = EYELIDS[0] in head.expression_names
     if clip.eyelids is not None and np.abs(clip.eyelids).max() > 1e-6 and not has_lids:
         if vertices is None:
             lost.append("eyelids (put l_eyelid.npy and r_eyelid.npy beside FLAME's model)")
@@ -226,6 +229,17 @@ def _posed(
         more = None if offset is None else offset[rows]
         parts.append(head.pose(betas, *moved, offset=more).numpy())
     return np.concatenate(parts)
+
+
+def _lids_last(
+    head: HeadModel, betas: np.ndarray, expression: np.ndarray, pose: np.ndarray
+) -> np.ndarray:
+    """Meshes whose eyelids close after skinning, as metrical-tracker has it, [F, V, 3]."""
+    lids = [head.expression_names.index(name) for name in EYELIDS]
+    bare = expression.copy()
+    bare[:, lids] = 0
+    closing = np.tensordot(expression[:, lids], head.expression_basis[lids], axes=1)
+    return _posed(head, betas, bare, pose) + closing.astype(np.float32)
 
 
 def _eyes_in_order(

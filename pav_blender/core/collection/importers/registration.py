@@ -10,7 +10,7 @@ import torch
 from ...head import HeadModel
 from ...head.flame import EYELIDS
 from ...head.model import CANONICAL_JAW_DEGREES
-from ...head.skinning import pose_vertices
+from ...head.skinning import joint_motions, pose_vertices, rotation_matrices
 
 JAW, EYES = 2, (3, 4)
 _STEPS = 6
@@ -31,24 +31,33 @@ def fit_shape(
 ) -> np.ndarray:
     """Betas [B] that best explain posed meshes [K, V, 3], given the rest.
 
-    A posed mesh is affine in the betas, so that this is one linear least-squares problem.
+    A posed mesh is affine in the betas, so that this is one linear least-squares problem; every
+    third vertex is enough for it.
     """
-    count = len(head.shape_basis)
-    still = np.zeros((count + 1, 3))
-    betas = np.concatenate([np.zeros((1, count)), np.eye(count)])
-    normal, right = np.zeros((count, count)), np.zeros(count)
+    whole = head._tensors(torch.device("cpu"), torch.float64)
+    chosen = torch.arange(0, head.vertex_count, 3)
+    basis, weights = whole["shape_basis"][:, chosen], whole["skinning_weights"][chosen]
+    rest_joints = whole["joint_regressor"] @ whole["template"]
+    joint_basis = whole["joint_regressor"] @ whole["shape_basis"]  # [B,J,3]
+    count = len(basis)
+    normal = torch.zeros(count, count, dtype=torch.float64)
+    right = torch.zeros(count, dtype=torch.float64)
+    none = np.zeros(count)
     for mesh, values, turns in zip(vertices, expression, pose, strict=True):
-        posed = head.pose(
-            torch.tensor(betas),
-            np.repeat(values[None], count + 1, 0),
-            np.repeat(turns[None], count + 1, 0),
-            still,
-        ).numpy()
-        columns = (posed[1:] - posed[0]).reshape(count, -1)
+        moved = torch.tensor(values)[None], torch.tensor(turns)[None], np.zeros((1, 3))
+        posed = head.pose(none, *moved)[0][chosen]
+        rotations = rotation_matrices(torch.tensor(turns))
+        joints = torch.cat([rest_joints[None], rest_joints + joint_basis])
+        every = rotations.expand(count + 1, *rotations.shape)
+        turn, shift = joint_motions(every, joints, whole["joint_parents"])
+        blended = torch.einsum("vj,jab->vab", weights, turn[0])
+        columns = torch.einsum("vab,nvb->nva", blended, basis)
+        columns += torch.einsum("vj,nja->nva", weights, shift[1:] - shift[0])
+        columns = columns.reshape(count, -1)
         normal += columns @ columns.T
-        right += columns @ (mesh - posed[0]).reshape(-1)
-    normal[np.diag_indices(count)] += 1e-9 * max(np.trace(normal) / count, 1e-12)
-    return np.linalg.solve(normal, right)
+        right += columns @ (torch.tensor(mesh, dtype=torch.float64)[chosen] - posed).reshape(-1)
+    normal += 1e-9 * max(float(normal.trace()) / count, 1e-12) * torch.eye(count).double()
+    return torch.linalg.solve(normal, right).numpy()
 
 
 def fit_pose(
