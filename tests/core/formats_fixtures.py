@@ -16,6 +16,7 @@ import zipfile
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from scipy import sparse
@@ -118,7 +119,7 @@ class _Ch:
 class Python2Pickler(pickle._Pickler):  # type: ignore[name-defined]
     """Writes byte strings and module names as Python 2 did."""
 
-    dispatch = dict(pickle._Pickler.dispatch)  # type: ignore[attr-defined]
+    dispatch: ClassVar = dict(pickle._Pickler.dispatch)  # type: ignore[attr-defined]
 
     def _text(self, text: str | bytes) -> None:
         data = text.encode("latin1") if isinstance(text, str) else text
@@ -399,16 +400,22 @@ def metrical_frame(act: Take, frame: int) -> tuple[dict, np.ndarray, np.ndarray]
     return content, vertices, world
 
 
-def write_metrical(path: Path, *, seed: int = 0, meshes: bool = True, frames: int = FRAMES) -> Take:
+def write_metrical(
+    path: Path, *, seed: int = 0, meshes: bool = True, matte: bool = False, frames: int = FRAMES
+) -> Take:
+    """matte: a folder of a user's own beside it, for the tracker writes none."""
     act = take(seed, frames)
-    for folder in ("checkpoint", "input", "mesh", "depth"):
+    for folder in ("checkpoint", "input", "mesh", "depth", *(["matte"] if matte else [])):
         (path / folder).mkdir(parents=True)
     for frame in range(frames):
         content, vertices, world = metrical_frame(act, frame)
         save_frame(path / f"checkpoint/{frame:05d}.frame", content)
         pixels, depth = project_cv(vertices, world, lens())
         act.truth[frame] = pixels
-        write_rgba(path / f"input/{frame:05d}.png", picture(pixels, depth))
+        rgba = picture(pixels, depth)
+        write_rgba(path / f"input/{frame:05d}.png", _opaque(rgba, 70))
+        if matte:
+            write_gray(path / f"matte/{frame:05d}.png", rgba[..., 3])
         if meshes:
             (path / f"mesh/{frame:05d}.ply").write_bytes(ply_bytes(vertices))
     return act
@@ -442,8 +449,8 @@ def write_insta(
         (path / folder).mkdir(parents=True)
     fx, fy, cx, cy = lens()
     height, width = SIZE
-    top = {"w": float(width), "h": float(height), "cx": cx, "cy": cy, "fl_x": fx, "fl_y": fy,
-           "camera_angle_x": 2 * np.arctan(width / fx / 2), "integer_depth_scale": 0.001}  # fmt: skip
+    top = {"w": float(width), "h": float(height), "cx": cx, "cy": cy, "fl_x": fx, "fl_y": fy}
+    top |= {"camera_angle_x": 2 * np.arctan(width / fx / 2), "integer_depth_scale": 0.001}
     entries = []
     for frame in range(frames):
         _, vertices, world = metrical_frame(act, frame)
@@ -557,12 +564,17 @@ def write_vhap(
                     "timestep_id": f"frame_{frame:05d}",
                     "camera_index": camera,
                     "camera_id": str(camera),
-                    "cx": cx, "cy": cy, "fl_x": fx, "fl_y": fy, "h": SIZE[0], "w": SIZE[1],
+                    "cx": cx,
+                    "cy": cy,
+                    "fl_x": fx,
+                    "fl_y": fy,
+                    "h": SIZE[0],
+                    "w": SIZE[1],
                     "transform_matrix": to_world.tolist(),
                     "file_path": f"images/{name}",
                     "fg_mask_path": f"fg_masks/{name}",
                     "flame_param_path": f"flame_param/{frame:05d}.npz",
-                }  # fmt: skip
+                }
             )
     np.savez(path / "canonical_flame_param.npz", shape=act.shape)
     top = {"timestep_indices": list(range(frames)), "camera_indices": list(range(cameras))}
@@ -609,7 +621,7 @@ def write_vhap_track(path: Path, *, seed: int = 0, frames: int = FRAMES) -> Take
     rows = []
     for frame in range(frames):
         content, vertices = vhap_rows(act, frame, dynamic=False)
-        vertices = vertices + [0, 0, 0.15]
+        vertices = vertices + np.array([0, 0, 0.15])
         content["translation"] = content["translation"] + np.float32([0, 0, 0.15])
         rows.append(content)
         centred = (FOCAL, FOCAL, width / 2, height / 2)

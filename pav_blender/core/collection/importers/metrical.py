@@ -16,6 +16,7 @@ from .rotations import axis_angle_of_6d
 from .source import Source, number_in, numbers, rotation_checked
 
 TITLE = "metrical-tracker"
+_MATTES = ("matte", "alpha", "mask")  # it writes none; a user's own may lie beside its pictures
 _SIZES = {"exp": 100, "shape": 300, "eyes": 12, "jaw": 6}
 
 
@@ -32,7 +33,8 @@ def read(path: Path, name: str) -> list[ParsedClip]:
         for folder in ("input", "images"):
             image = source.picture(f"{folder}/{frame}")
             if image:
-                return Picture(image)
+                mattes = (source.picture(f"{matte}/{frame}") for matte in _MATTES)
+                return Picture(image, next((m for m in mattes if m), None))
         return None
 
     return [read_checkpoints(source, name, TITLE, picture)]
