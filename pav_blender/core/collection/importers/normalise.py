@@ -25,7 +25,7 @@ SHAPES = ("mean", "first")
 EXPLAINED = 1e-4  # metres: parameters that pose a mesh as near as this stand for it
 _CHUNK = 64
 _FIT_FRAMES = 8
-_ROUNDS = 6
+_ROUNDS = 4
 
 
 @dataclass(eq=False)

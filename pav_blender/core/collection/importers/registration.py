@@ -32,10 +32,10 @@ def fit_shape(
     """Betas [B] that best explain posed meshes [K, V, 3], given the rest.
 
     A posed mesh is affine in the betas, so that this is one linear least-squares problem; every
-    third vertex is enough for it.
+    fourth vertex is enough for it.
     """
     whole = head._tensors(torch.device("cpu"), torch.float64)
-    chosen = torch.arange(0, head.vertex_count, 3)
+    chosen = torch.arange(0, head.vertex_count, 4)
     basis, weights = whole["shape_basis"][:, chosen], whole["skinning_weights"][chosen]
     rest_joints = whole["joint_regressor"] @ whole["template"]
     joint_basis = whole["joint_regressor"] @ whole["shape_basis"]  # [B,J,3]
