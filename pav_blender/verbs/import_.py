@@ -71,7 +71,8 @@ def run(args: argparse.Namespace) -> int:
     if not args.sources:
         print("remembered; no sources were named")
         return 0
-    parsed = read_sources(args.sources, args.format)
+    reading = Progress("read", as_json=args.json_progress)
+    parsed = read_sources(args.sources, args.format, reading)
     person: Person = normalise(
         parsed,
         head,

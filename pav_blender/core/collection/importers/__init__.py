@@ -1,6 +1,6 @@
 """Importers: what other trackers and avatar systems wrote, as a collection.
 
-One module a format, with `TITLE`, `looks_like(path)` and `read(path, name) -> list[ParsedClip]`;
+One module a format: `TITLE`, `looks_like(path)`, `read(path, name, tell) -> list[ParsedClip]`;
 `normalise` and `write_person` are common to all.
 """
 
@@ -10,6 +10,7 @@ import re
 from pathlib import Path
 
 from ...errors import InputError
+from ...progress import Report
 from . import flashavatar, imavatar, insta, metrical, nerface, vhap, vhap_track
 from .normalise import NormalClip, Person, normalise
 from .parsed import ParsedClip, Picture
@@ -60,17 +61,24 @@ def split_name(source: str) -> tuple[str, Path]:
     return plain or "clip", place
 
 
-def read_sources(sources: list[str], format_name: str = "auto") -> list[ParsedClip]:
+def read_sources(
+    sources: list[str], format_name: str = "auto", progress: Report | None = None
+) -> list[ParsedClip]:
     """Every clip of sources "PATH" or "NAME=PATH"; a source is an appearance, called NAME."""
     if format_name != "auto" and format_name not in FORMATS:
         raise InputError(f"--format {format_name!r}: auto, {', '.join(FORMATS)}")
     clips = []
-    for source in sources:
+    for at, source in enumerate(sources):
         name, path = split_name(source)
         found = detect(path) if format_name == "auto" else format_name
         if not path.is_dir():
             raise InputError(f"{path}: no such folder; a source is the folder its tool wrote")
-        for clip in FORMATS[found].read(path, name):
+
+        def tell(part: float, at: int = at, name: str = name) -> None:
+            if progress:
+                progress((at + part) / len(sources), source=name)
+
+        for clip in FORMATS[found].read(path, name, tell):
             clip.name = re.sub(r"[^A-Za-z0-9_.-]+", "_", clip.name)[:64]
             clip.appearance = clip.appearance or name
             clips.append(clip)

@@ -11,7 +11,7 @@ from ...errors import InputError
 from .labels import MOUTH, NECK_AND_HEAD
 from .metrical import read_checkpoints
 from .parsed import ParsedClip, Picture
-from .source import Source
+from .source import Source, Tell
 
 TITLE = "FlashAvatar"
 HELD_OUT = 500  # the frames its own evaluation holds out
@@ -23,17 +23,17 @@ def looks_like(path: Path) -> bool:
     return _joined(path) or bool(_people(path))
 
 
-def read(path: Path, name: str) -> list[ParsedClip]:
+def read(path: Path, name: str, tell: Tell = None) -> list[ParsedClip]:
     """A clip of a folder that holds both parts, or one a person of FlashAvatar's root."""
     source = Source(path)
     if _joined(path):
-        return [_read(source, source, name)]
+        return [_read(source, source, name, tell)]
     people = _people(path)
     clips = []
     for person in people:
         pictures = Source(source.path(f"dataset/{person}"))
         track = Source(source.path(f"metrical-tracker/output/{person}"))
-        clips.append(_read(track, pictures, name if len(people) == 1 else f"{name}_{person}"))
+        clips.append(_read(track, pictures, name if len(people) == 1 else f"{name}_{person}", tell))
     return clips
 
 
@@ -47,7 +47,7 @@ def _people(path: Path) -> list[str]:
     return sorted(f.name for f in folders if (output / f.name / "checkpoint").is_dir())
 
 
-def _read(track: Source, pictures: Source, name: str) -> ParsedClip:
+def _read(track: Source, pictures: Source, name: str, tell: Tell) -> ParsedClip:
     if not (pictures.root / "imgs").is_dir():
         raise InputError(f"{pictures.root}: no folder imgs of pictures")
 
@@ -62,4 +62,4 @@ def _read(track: Source, pictures: Source, name: str) -> ParsedClip:
         labels = tuple((place, table) for place, table in layers if place)
         return Picture(image, pictures.picture(f"alpha/{number}"), labels)
 
-    return read_checkpoints(track, name, TITLE, picture, HELD_OUT)
+    return read_checkpoints(track, name, TITLE, picture, tell, HELD_OUT)

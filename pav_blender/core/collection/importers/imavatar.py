@@ -10,7 +10,7 @@ import numpy as np
 from ...errors import InputError
 from .labels import PARSING
 from .parsed import POSE_JOINTS, ParsedClip, Picture, stacked
-from .source import Source, frames_of, number_in, numbers, rotation_checked
+from .source import Source, Tell, counted, frames_of, number_in, numbers, rotation_checked
 
 TITLE = "IMavatar"
 FILE = "flame_params.json"
@@ -23,14 +23,14 @@ def looks_like(path: Path) -> bool:
     return bool(_folders(path))
 
 
-def read(path: Path, name: str) -> list[ParsedClip]:
+def read(path: Path, name: str, tell: Tell = None) -> list[ParsedClip]:
     """A clip for each folder that has the file."""
     source = Source(path)
     folders = _folders(path)
     clips = []
     for folder in folders:
         inner = Source(source.path(folder.name)) if folder != path else source
-        clips.append(_read(inner, name if len(folders) == 1 else f"{name}_{folder.name}"))
+        clips.append(_read(inner, name if len(folders) == 1 else f"{name}_{folder.name}", tell))
     return clips
 
 
@@ -40,7 +40,7 @@ def _folders(path: Path) -> list[Path]:
     return sorted(p.parent for p in path.glob(f"*/{FILE}"))
 
 
-def _read(source: Source, name: str) -> ParsedClip:
+def _read(source: Source, name: str, tell: Tell) -> ParsedClip:
     file = source.root / FILE
     content = source.json(FILE)
     frames = frames_of(content, file)
@@ -50,7 +50,7 @@ def _read(source: Source, name: str) -> ParsedClip:
         raise InputError(f"{file}: shape_params or intrinsics do not fit FLAME")
     rows: list[dict[str, Any]] = []
     skipped: list[str] = []
-    for frame in frames:
+    for frame in counted(frames, tell):
         key = frame.get("file_path")
         image = source.find(key, (".png", ".jpg", ""))
         if image is None:

@@ -13,6 +13,8 @@ from .meshes import read_vertices
 from .parsed import ParsedClip, Picture, padded_pose, stacked
 from .source import (
     Source,
+    Tell,
+    counted,
     first_frame,
     frames_of,
     number_in,
@@ -32,13 +34,13 @@ def looks_like(path: Path) -> bool:
     return any("mesh_path" in frame for frame in frames)
 
 
-def read(path: Path, name: str) -> list[ParsedClip]:
+def read(path: Path, name: str, tell: Tell = None) -> list[ParsedClip]:
     """One clip. World: metres, FLAME's axes, the head still; cameras in OpenCV axes."""
     source = Source(path)
     frames, splits, top = _frames(source)
     rows: list[dict[str, Any]] = []
     skipped: list[str] = []
-    for key, frame in frames.items():
+    for key, frame in counted(frames.items(), tell):
         row = _row(source, key, frame, top, skipped)
         if row:
             rows.append(row | {"split": splits.get(key, "train")})

@@ -5,6 +5,7 @@ Their faces are not read: INSTA's have 8090 of FLAME's 9976 and leave 958 vertic
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,14 @@ def read_vertices(path: Path) -> np.ndarray:
     try:
         content = path.read_bytes()
         found = _ply(content) if path.suffix == ".ply" else _obj(content)
-    except (OSError, ValueError, UnicodeDecodeError, IndexError, KeyError) as error:
+    except (
+        OSError,
+        ValueError,
+        DeprecationWarning,
+        UnicodeDecodeError,
+        IndexError,
+        KeyError,
+    ) as error:
         raise InputError(f"{path}: not a readable mesh ({error})") from error
     if found.shape != (VERTICES, 3):
         raise InputError(f"{path}: {len(found)} vertices; FLAME has {VERTICES}")
@@ -32,9 +40,11 @@ def read_vertices(path: Path) -> np.ndarray:
 
 def _obj(content: bytes) -> np.ndarray:
     lines = [line[2:] for line in content.split(b"\n") if line.startswith(b"v ")]
-    values = np.array(b" ".join(lines).split(), np.float32)
-    if lines and len(values) % len(lines):
-        raise ValueError("lines of vertices differ in length")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # what is no number
+        values = np.fromstring(b" ".join(lines), np.float32, sep=" ")
+    if not lines or len(values) % len(lines) or len(values) < 3 * len(lines):
+        raise ValueError("lines of vertices are missing or differ in length")
     return values.reshape(len(lines), -1)[:, :3]
 
 

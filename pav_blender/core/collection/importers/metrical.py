@@ -13,7 +13,7 @@ from ...pickles import read_torch
 from .meshes import read_vertices
 from .parsed import ParsedClip, Picture, padded_pose, stacked
 from .rotations import axis_angle_of_6d
-from .source import Source, number_in, numbers, rotation_checked
+from .source import Source, Tell, counted, number_in, numbers, rotation_checked
 
 TITLE = "metrical-tracker"
 _MATTES = ("matte", "alpha", "mask")  # it writes none; a user's own may lie beside its pictures
@@ -25,7 +25,7 @@ def looks_like(path: Path) -> bool:
     return any((path / "checkpoint").glob("*.frame")) and not (path / "imgs").is_dir()
 
 
-def read(path: Path, name: str) -> list[ParsedClip]:
+def read(path: Path, name: str, tell: Tell = None) -> list[ParsedClip]:
     """One clip; `mesh/*.ply`, where they are, decide what parameters leave open."""
     source = Source(path)
 
@@ -37,16 +37,22 @@ def read(path: Path, name: str) -> list[ParsedClip]:
                 return Picture(image, next((m for m in mattes if m), None))
         return None
 
-    return [read_checkpoints(source, name, TITLE, picture)]
+    return [read_checkpoints(source, name, TITLE, picture, tell)]
 
 
 def read_checkpoints(
-    source: Source, name: str, tool: str, picture: Callable[[str], Picture | None], habit: int = 0
+    source: Source,
+    name: str,
+    tool: str,
+    picture: Callable[[str], Picture | None],
+    tell: Tell = None,
+    habit: int = 0,
 ) -> ParsedClip:
     """Every checkpoint of a source; picture: of the checkpoint called so, None where missing."""
     rows, skipped, size = [], [], None
     shapes = []
-    for file in sorted((source.root / "checkpoint").glob("*.frame")):
+    files = sorted((source.root / "checkpoint").glob("*.frame"))
+    for file in counted(files, tell):
         place = source.path(f"checkpoint/{file.name}")
         content = read_torch(place)
         frame = _name(content, place)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ...errors import InputError
 from .parsed import ParsedClip
-from .source import first_frame, peek_json
+from .source import Tell, first_frame, peek_json
 
 TITLE = "NeRFace"
 _FILES = ("transforms_train.json", "transforms.json", "transforms_test.json", "transforms_val.json")
@@ -18,7 +18,7 @@ def looks_like(path: Path) -> bool:
     return any("expression" in f and "mesh_path" not in f for f in frames)
 
 
-def read(path: Path, name: str) -> list[ParsedClip]:
+def read(path: Path, name: str, tell: Tell = None) -> list[ParsedClip]:
     """Raises InputError: there is no mesh, and its coefficients are of another face model."""
     raise InputError(
         f"{path}: a NeRFace dataset ({name}) has no mesh and no identity, and its 76 expression "

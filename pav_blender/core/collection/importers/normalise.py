@@ -23,6 +23,7 @@ from .rotations import matrices
 
 SHAPES = ("mean", "first")
 EXPLAINED = 1e-4  # metres: parameters that pose a mesh as near as this stand for it
+_ANOTHER = 0.02  # metres: a mesh as far as this on average is not what was tracked
 _CHUNK = 64
 _FIT_FRAMES = 8
 _ROUNDS = 4
@@ -174,7 +175,7 @@ def _normal(
             notes.append("eyelids are in the meshes only; l_eyelid.npy and r_eyelid.npy beside "
                          "FLAME's model would make them expressions")  # fmt: skip
     if vertices is not None:
-        vertices = _beyond_parameters(head, betas, expression, pose, vertices, notes)
+        vertices = _beyond_parameters(head, betas, expression, pose, vertices, notes, clip.name)
     intrinsics, width, height, has_matte = _pixels(clip, notes)
     result = Clip(
         name=clip.name,
@@ -270,9 +271,15 @@ def _beyond_parameters(
     pose: np.ndarray,
     vertices: np.ndarray,
     notes: list[str],
+    name: str,
 ) -> np.ndarray | None:
     """The meshes, or None where the parameters pose them just so."""
     distance = np.linalg.norm(_posed(head, betas, expression, pose) - vertices, axis=2)
+    if not distance.mean() < _ANOTHER:
+        raise InputError(
+            f"clip {name}: its meshes lie {distance.mean():.3g} m from what its parameters pose on "
+            f"{head.name}: another head, another unit, or another FLAME"
+        )
     if distance.max() <= EXPLAINED:
         return None
     notes.append(

@@ -63,6 +63,7 @@ class ParsedClip:
         return len(self.frame_id)
 
 
+_LARGEST = 1e7  # metres, radians, pixels or coefficients: more is as good as infinite
 _ROW = ("expression", "pose", "translation", "intrinsics", "camera_to_world")
 _OPTIONAL = ("eyelids", "vertices", "moving_offset")
 
@@ -77,7 +78,7 @@ def stacked(name: str, tool: str, rows: list[dict[str, Any]], **rest: Any) -> Pa
     kept: dict[int, dict[str, Any]] = {}
     for row in rows:
         number = int(row["frame_id"])
-        bad = [k for k in (*_ROW, *_OPTIONAL) if k in row and not np.isfinite(row[k]).all()]
+        bad = [k for k in (*_ROW, *_OPTIONAL) if k in row and not _sensible(row[k])]
         if bad:
             skipped.append(f"frame {number}: {bad[0]} is not finite")
         elif number in kept:
@@ -92,9 +93,9 @@ def stacked(name: str, tool: str, rows: list[dict[str, Any]], **rest: Any) -> Pa
         key: np.stack([np.asarray(row[key], np.float64) for row in used]) for key in _ROW
     }
     arrays["expression"] = arrays["expression"][:, :100]
+    arrays["camera_to_world"][:, 3] = (0, 0, 0, 1)
     for key in _OPTIONAL:
-        has = ["skip" for row in used if row.get(key) is None]
-        if not has:
+        if all(row.get(key) is not None for row in used):
             kind = np.float64 if key == "eyelids" else np.float32
             arrays[key] = np.stack([np.asarray(row[key], kind) for row in used])
     return ParsedClip(
@@ -107,6 +108,10 @@ def stacked(name: str, tool: str, rows: list[dict[str, Any]], **rest: Any) -> Pa
         **arrays,
         **rest,
     )
+
+
+def _sensible(values: Any) -> bool:
+    return bool((np.abs(values) < _LARGEST).all())  # false for what is no number
 
 
 def padded_pose(**joints: np.ndarray) -> np.ndarray:

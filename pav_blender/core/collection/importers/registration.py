@@ -49,7 +49,7 @@ def fit_shape(
         rotations = rotation_matrices(torch.tensor(turns))
         joints = torch.cat([rest_joints[None], rest_joints + joint_basis])
         every = rotations.expand(count + 1, *rotations.shape)
-        turn, shift = joint_motions(every, joints, whole["joint_parents"])
+        turn, shift = joint_motions(every, joints, head.joint_parents.tolist())
         blended = torch.einsum("vj,jab->vab", weights, turn[0])
         columns = torch.einsum("vab,nvb->nva", blended, basis)
         columns += torch.einsum("vj,nja->nva", weights, shift[1:] - shift[0])

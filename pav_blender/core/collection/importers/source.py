@@ -5,13 +5,16 @@ from __future__ import annotations
 import json
 import re
 import zipfile
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from ...errors import InputError
 
+T = TypeVar("T")
+Tell = Callable[[float], None] | None  # of a reader: the part done, from 0 to 1
 _LARGEST_JSON = 512 << 20
 PICTURES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG")
 
@@ -90,7 +93,8 @@ def read_json(path: Path) -> dict[str, Any]:
 def peek_json(path: Path) -> dict[str, Any]:
     """A JSON object, or an empty one where there is none: for telling formats apart."""
     try:
-        return read_json(path) if path.is_file() else {}
+        inside = path.resolve().parent == path.parent.resolve()
+        return read_json(path) if inside and path.is_file() else {}
     except InputError:
         return {}
 
@@ -113,13 +117,21 @@ def numbers(value: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
     """`value` as float64 of a shape (-1: any size); InputError names `what`. May be non-finite."""
     try:
         array = np.asarray(value, np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{what}: not numbers") from error
     if len(array.shape) != len(shape) or any(
         want not in (-1, got) for want, got in zip(shape, array.shape, strict=True)
     ):
         raise InputError(f"{what}: shape {list(array.shape)}, {list(shape)} is needed")
     return array
+
+
+def counted(items: Collection[T], tell: Tell) -> Iterator[T]:
+    """The items, one after another; `tell` hears what part is done."""
+    for done, item in enumerate(items, 1):
+        yield item
+        if tell:
+            tell(done / len(items))
 
 
 def number_in(name: str) -> int | None:

@@ -16,6 +16,8 @@ from ...errors import InputError
 from .parsed import POSE_JOINTS, VERTICES, ParsedClip, Picture, stacked
 from .source import (
     Source,
+    Tell,
+    counted,
     first_frame,
     frames_of,
     numbers,
@@ -35,7 +37,7 @@ def looks_like(path: Path) -> bool:
     return any("flame_param_path" in frame for frame in frames)
 
 
-def read(path: Path, name: str) -> list[ParsedClip]:
+def read(path: Path, name: str, tell: Tell = None) -> list[ParsedClip]:
     """One clip a sequence and camera; sequences of a combined folder are told apart again."""
     source = Source(path, siblings=True)
     groups, splits = _groups(source)
@@ -47,7 +49,7 @@ def read(path: Path, name: str) -> list[ParsedClip]:
         parts = [name if len(sequences) == 1 else sequence or name]
         if cameras[sequence] > 1:
             parts.append(f"cam{camera}")
-        clip = _read(source, "_".join(parts), frames, splits, cache)
+        clip = _read(source, "_".join(parts), frames, splits, cache, tell)
         clip.appearance = name
         clips.append(clip)
     return clips
@@ -86,12 +88,13 @@ def _read(
     frames: dict[str, dict],
     splits: dict[str, str],
     cache: dict[str, dict[str, np.ndarray]],
+    tell: Tell,
 ) -> ParsedClip:
     rows: list[dict[str, Any]] = []
     skipped: list[str] = []
     lost: set[str] = set()
     shapes, offsets, size = [], [], None
-    for key, frame in frames.items():
+    for key, frame in counted(frames.items(), tell):
         image = source.picture(key)
         parameters = frame.get("flame_param_path")
         if image is None or source.find(parameters) is None:
@@ -210,6 +213,6 @@ def _number(key: str, frame: dict) -> int:
     """The time step in a picture's name TTTTT_CC, which restarts with each sequence."""
     match = re.search(r"(\d{1,9})_(\d+)\.\w+$", key)
     step = int(match[1]) if match else frame.get("timestep_index")
-    if not isinstance(step, int) or step < 0:
+    if not isinstance(step, int) or not 0 <= step < 10**9:
         raise InputError(f"{key}: the frame has no time step")
     return step

@@ -10,7 +10,7 @@ import numpy as np
 
 from ...errors import InputError
 from .parsed import ParsedClip, Picture, stacked
-from .source import Source, number_in, numbers
+from .source import Source, Tell, counted, number_in, numbers
 from .vhap import flame_parameters
 
 TITLE = "VHAP track"
@@ -22,7 +22,7 @@ def looks_like(path: Path) -> bool:
     return _track(path) is not None
 
 
-def read(path: Path, name: str) -> list[ParsedClip]:
+def read(path: Path, name: str, tell: Tell = None) -> list[ParsedClip]:
     """One clip. The pictures are looked for in `images` beside the track, or above it."""
     source = Source(path)
     file = _track(path)
@@ -50,7 +50,7 @@ def read(path: Path, name: str) -> list[ParsedClip]:
     skipped: list[str] = []
     lost = {"the texture"}
     shape = offset = None
-    for at, step in enumerate(content["timestep_id"].tolist()):
+    for at, step in counted(list(enumerate(content["timestep_id"].tolist())), tell):
         step = f"{step:05d}" if isinstance(step, int) else str(step)
         image = source.picture(f"images/{step}")
         if image is None:

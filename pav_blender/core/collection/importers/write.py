@@ -45,7 +45,7 @@ def write_person(
         overwrite=overwrite,
     ) as writer:
         for each in person.clips:
-            with ThreadPoolExecutor(os.cpu_count()) as pool:
+            with ThreadPoolExecutor(_threads()) as pool:
                 jobs = [pool.submit(_write, writer, each, row) for row in range(len(each.clip))]
                 try:
                     for job in as_completed(jobs):
@@ -60,6 +60,10 @@ def write_person(
                         job.cancel()
                     raise
             writer.clip(each.clip)
+
+
+def _threads() -> int:
+    return int(os.environ.get("PAV_THREADS") or os.cpu_count() or 1)
 
 
 def _write(writer: CollectionWriter, each: NormalClip, row: int) -> None:
