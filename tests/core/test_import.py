@@ -7,14 +7,19 @@ from pathlib import Path
 import formats_fixtures as formats
 import numpy as np
 import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from pav_blender.core.collection import LABELS, read_collection
 from pav_blender.core.collection.importers import detect, normalise, read_sources, write_person
+from pav_blender.core.collection.importers.meshes import read_vertices
 from pav_blender.core.errors import InputError
 from pav_blender.core.evaluation.check import check
 from pav_blender.core.head.flame import read_flame
 from pav_blender.core.head.library import remember_head
 from pav_blender.core.images import read_gray, read_rgba
+from pav_blender.core.pickles import read_torch
 from pav_blender.core.training.frames import camera_of
 
 
@@ -435,3 +440,74 @@ def test_nothing_is_left_where_a_picture_does_not_fit(tmp_path, heads, make):
     with pytest.raises(InputError, match=r"00004_00\.png"):
         write_person(person, tmp_path / "out" / "c")
     assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_frames_without_the_matte_that_others_have_are_skipped(tmp_path, make):
+    make(formats.write_vhap, tmp_path / "v")
+    (tmp_path / "v/fg_masks/00002_00.png").unlink()
+    (clip,) = read_sources([str(tmp_path / "v")])
+    assert clip.skipped == ["frame 2: its matte is missing"]
+    assert len(clip) == formats.FRAMES - 1
+
+
+def test_a_description_that_is_a_link_is_not_read(tmp_path, make):
+    make(formats.write_insta, tmp_path / "in/source")
+    for name in ("transforms", "transforms_train", "transforms_test", "transforms_val"):
+        description = tmp_path / f"in/source/{name}.json"
+        description.rename(tmp_path / description.name)
+        description.symlink_to(tmp_path / description.name)
+    with pytest.raises(InputError, match="not a folder of"):
+        detect(tmp_path / "in/source")
+    with pytest.raises(InputError, match="leads out"):
+        read_sources([str(tmp_path / "in/source")], "insta")
+
+
+def test_numbers_beyond_all_measure_are_told(tmp_path, make):
+    make(formats.write_imavatar, tmp_path / "huge")
+    make(formats.write_imavatar, tmp_path / "large")
+    file = "flame_params.json"
+    formats.rewrite_json(tmp_path / "huge" / file, first_path("pose", [10**400] * 15))
+    with pytest.raises(InputError, match="pose: not numbers"):
+        read_sources([str(tmp_path / "huge")])
+    formats.rewrite_json(tmp_path / "large" / file, first_path("expression", [1e30] * 50))
+    (clip,) = read_sources([str(tmp_path / "large")])
+    assert clip.skipped == ["frame 1: expression is not finite"]
+
+
+def test_meshes_in_another_unit_are_refused(tmp_path, heads, make):
+    make(formats.write_metrical, tmp_path / "m")
+    parsed = read_sources([str(tmp_path / "m")])
+    parsed[0].vertices *= 1000
+    with pytest.raises(InputError, match="another head, another unit"):
+        normalise(parsed, heads["2020"])
+
+
+def test_checkpoints_of_torch_itself(tmp_path):
+    act = formats.take()
+    content, _, _ = formats.metrical_frame(act, 1)
+    torch.save(content, tmp_path / "a.frame")
+    back = read_torch(tmp_path / "a.frame")
+    np.testing.assert_array_equal(back["flame"]["exp"], content["flame"]["exp"])
+    assert back["frame_id"] == "00001"
+    torch.save({"flame": torch.zeros(3)}, tmp_path / "b.frame")
+    with pytest.raises(InputError, match=r"b\.frame: refused to unpickle"):
+        read_torch(tmp_path / "b.frame")
+
+
+MESHES = (
+    (".obj", formats.obj_text(np.zeros((3, 3))).encode()[:80]),
+    (".ply", formats.ply_bytes(np.zeros((3, 3)))[:400]),
+)
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.data())
+def test_damaged_meshes_only_ever_raise_input_errors(tmp_path_factory, data):
+    ending, whole = data.draw(st.sampled_from(MESHES))
+    content = bytearray(whole)
+    for _ in range(data.draw(st.integers(0, 5))):
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    path = tmp_path_factory.getbasetemp() / f"mesh{ending}"
+    path.write_bytes(bytes(content[: data.draw(st.integers(0, len(content)))]))
+    with pytest.raises(InputError, match="mesh"):
+        read_vertices(path)

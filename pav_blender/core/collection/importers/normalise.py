@@ -212,8 +212,12 @@ def fixed_head(
 
 
 def _unmoved(vertices: np.ndarray, motion: np.ndarray) -> np.ndarray:
-    turned = (vertices - motion[:, None, :3, 3]) @ motion[:, :3, :3]
-    return turned.astype(np.float32)
+    if np.allclose(motion, np.eye(4), atol=1e-12):
+        return vertices
+    turned = np.empty(vertices.shape, np.float32)
+    for row, (mesh, matrix) in enumerate(zip(vertices, motion, strict=True)):
+        turned[row] = (mesh - matrix[:3, 3]) @ matrix[:3, :3]
+    return turned
 
 
 def _posed(
@@ -274,7 +278,11 @@ def _beyond_parameters(
     name: str,
 ) -> np.ndarray | None:
     """The meshes, or None where the parameters pose them just so."""
-    distance = np.linalg.norm(_posed(head, betas, expression, pose) - vertices, axis=2)
+    distance = np.empty(vertices.shape[:2], np.float32)
+    for start in range(0, len(pose), _CHUNK):
+        rows = slice(start, start + _CHUNK)
+        away = _posed(head, betas, expression[rows], pose[rows]) - vertices[rows]
+        distance[rows] = np.linalg.norm(away, axis=2)
     if not distance.mean() < _ANOTHER:
         raise InputError(
             f"clip {name}: its meshes lie {distance.mean():.3g} m from what its parameters pose on "

@@ -71,16 +71,20 @@ _OPTIONAL = ("eyelids", "vertices", "moving_offset")
 def stacked(name: str, tool: str, rows: list[dict[str, Any]], **rest: Any) -> ParsedClip:
     """A clip out of rows in order: each a dict of the arrays of a frame, `frame_id` and `picture`.
 
-    Rows with values that are not finite, or whose number came before, are left out by name.
+    Rows with values that are not finite, whose number came before, or that lack the matte that
+    others have, are left out by name.
     InputError where none is left.
     """
     skipped = list(rest.pop("skipped", ()))
     kept: dict[int, dict[str, Any]] = {}
+    cut = any(row["picture"].matte for row in rows)
     for row in rows:
         number = int(row["frame_id"])
         bad = [k for k in (*_ROW, *_OPTIONAL) if k in row and not _sensible(row[k])]
         if bad:
             skipped.append(f"frame {number}: {bad[0]} is not finite")
+        elif cut and row["picture"].matte is None:
+            skipped.append(f"frame {number}: its matte is missing")
         elif number in kept:
             skipped.append(f"frame {number}: there twice")
         else:

@@ -43,7 +43,7 @@ def read(path: Path, name: str, tell: Tell = None) -> list[ParsedClip]:
     groups, splits = _groups(source)
     sequences = list(dict.fromkeys(sequence for sequence, _ in groups))
     cameras = {sequence: sum(s == sequence for s, _ in groups) for sequence in sequences}
-    cache: dict[str, dict[str, np.ndarray]] = {}
+    cache = _Parameters(source)
     clips = []
     for (sequence, camera), frames in groups.items():
         parts = [name if len(sequences) == 1 else sequence or name]
@@ -82,35 +82,48 @@ def _groups(source: Source) -> tuple[dict[tuple[str, str], dict[str, dict]], dic
     return groups, {key: names.get(kind, "train") for key, kind in found.items()}
 
 
+class _Parameters:
+    """Frames' parameters, each file read once for all cameras. An offset that is static is kept
+    once for the folder, whose files all repeat it."""
+
+    def __init__(self, source: Source) -> None:
+        self.lost: set[str] = set()
+        self._source = source
+        self._rows: dict[str, dict[str, np.ndarray]] = {}
+        self._offsets: dict[str, np.ndarray | None] = {}
+
+    def row(self, name: str) -> dict[str, np.ndarray]:
+        if name not in self._rows:
+            what = f"{self._source.root}: {name}"
+            row = flame_parameters(self._source.arrays(name), what, self.lost)
+            self._offsets.setdefault(name.rpartition("/")[0], row.pop("offset", None))
+            self._rows[name] = row
+        return self._rows[name]
+
+    def offset(self, name: str) -> np.ndarray | None:
+        return self._offsets.get(name.rpartition("/")[0])
+
+
 def _read(
     source: Source,
     name: str,
     frames: dict[str, dict],
     splits: dict[str, str],
-    cache: dict[str, dict[str, np.ndarray]],
+    cache: _Parameters,
     tell: Tell,
 ) -> ParsedClip:
     rows: list[dict[str, Any]] = []
     skipped: list[str] = []
-    lost: set[str] = set()
-    shapes, offsets, size = [], [], None
+    shapes, size, parameters = [], None, ""
     for key, frame in counted(frames.items(), tell):
         image = source.picture(key)
-        parameters = frame.get("flame_param_path")
+        parameters = str(frame.get("flame_param_path", ""))
         if image is None or source.find(parameters) is None:
-            part = "picture" if image is None else "FLAME parameters"
-            skipped.append(f"{key}: its {part} are missing".replace("picture are", "picture is"))
+            what = "picture is" if image is None else "FLAME parameters are"
+            skipped.append(f"{key}: its {what} missing")
             continue
-        assert isinstance(parameters, str)
-        if parameters not in cache:
-            cache[parameters] = flame_parameters(
-                source.arrays(parameters), f"{source.root}: {parameters}", lost
-            )
-        row = dict(cache[parameters])
+        row = dict(cache.row(parameters))
         shapes.append(row.pop("shape"))
-        offset = row.pop("offset", None)
-        if offset is not None:
-            offsets.append(offset)
         matte = source.picture(frame["fg_mask_path"]) if frame.get("fg_mask_path") else None
         camera, intrinsics, here = _camera(frame, f"{source.root}: {key}")
         if size not in (None, here):
@@ -137,9 +150,9 @@ def _read(
         width=size[0],
         height=size[1],
         shape=np.mean(shapes, 0),
-        offset=np.mean(offsets, 0) if len(offsets) == len(rows) else None,
+        offset=cache.offset(parameters),
         skipped=skipped,
-        lost=sorted(lost),
+        lost=sorted(cache.lost),
     )
 
 
@@ -188,7 +201,7 @@ def flame_parameters(
             )
         if len(offset) > VERTICES:
             lost.add(f"the {TEETH} vertices of VHAP's own teeth")
-        row[ours] = offset[:VERTICES].astype(np.float64)
+        row[ours] = offset[:VERTICES].astype(np.float32)
     if "offset" in row and not np.isfinite(row["offset"]).all():
         raise InputError(f"{what}: static_offset is not finite")
     if not np.isfinite(row["shape"]).all():
