@@ -31,7 +31,8 @@ class Rig:
 def build_rig(head: HeadModel, betas: np.ndarray, name: str, collection: Any) -> Rig:
     """Builds the head of identity `betas` [B] and links its objects to a Blender `collection`.
 
-    The evaluated mesh equals `head.pose(betas, expression, pose, translation)`.
+    The evaluated mesh equals `head.pose(betas, expression, pose, translation)`, but for heads whose
+    joints follow the expression: bones stay where the identity has them.
     """
     mesh = _build_mesh(head, betas, name, collection)
     armature = _build_armature(head, betas, f"{name} armature", collection)

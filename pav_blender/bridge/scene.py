@@ -219,6 +219,8 @@ def run(args: argparse.Namespace) -> int:
         _scene().render.filepath = f"//{args.out.stem}/"
         save_copy(args.out)
     print(f"{args.out}: clip {clip.name}, {len(clip)} frames")
+    if clip.vertices is not None:
+        print("  the clip has meshes beyond its parameters: the rig moves by the parameters alone")
     return 0
 
 

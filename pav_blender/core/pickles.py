@@ -93,6 +93,8 @@ _ALLOWED: dict[tuple[str, str], Any] = {
     ("copyreg", "_reconstructor"): _reconstruct,
     ("__builtin__", "object"): _Parts,
     ("builtins", "object"): _Parts,
+    ("__builtin__", "set"): _Parts,  # chumpy keeps some beside its numbers
+    ("builtins", "set"): _Parts,
     ("collections", "OrderedDict"): dict,
 }
 for _core in ("numpy.core", "numpy._core"):

@@ -212,3 +212,26 @@ def test_opaque_frames_hold_the_world_as_f12_does(scene, files, tmp_path):
     frames = [tmp_path / "frames" / "000003.png", tmp_path / "f12.png"]
     written, rendered = (images.read_rgba(path).astype(int) for path in frames)
     assert np.abs(written - rendered).max() <= 1
+
+
+def test_a_head_that_is_remembered_comes_with_its_persons_offset(
+    registered, files, tmp_path, monkeypatch
+):
+    """As of an imported FLAME track: the avatar has a fingerprint and an offset, no model."""
+    from pav_blender.core.field.avatar import Avatar
+    from pav_blender.core.head import builtin_head, read_head, remember_head, write_head
+
+    monkeypatch.setenv("PAV_CONFIG", str(tmp_path / "config"))
+    write_head(tmp_path / "other.npz", builtin_head(), step=2e-6)
+    avatar = Avatar.load(files / "small.pav")
+    head = read_head(tmp_path / "other.npz")
+    avatar.head_name, avatar.head_fingerprint = "other", head.fingerprint
+    avatar.head_offset = np.full((head.vertex_count, 3), 0.01, np.float32)
+    avatar.save(tmp_path / "other.pav")
+    with pytest.raises(InputError, match=r"other\.pav: the head 'other'.*pav import --head"):
+        bridge_scene.build_head(tmp_path / "other.pav")
+    remember_head(tmp_path / "other.npz")
+    rig = bridge_scene.build_head(tmp_path / "other.pav")
+    found = mesh.vertices(rig.mesh.data)
+    expected = head.shaped(avatar.betas) + avatar.head_offset
+    assert np.abs(found - expected).max() < 1e-6

@@ -113,7 +113,8 @@ class _Ch:
 
     def __init__(self, x: np.ndarray) -> None:
         self.x = x
-        self.dirty_vars = ["x"]
+        self._dirty_vars = {"x"}
+        self._itr = None
 
 
 class Python2Pickler(pickle._Pickler):  # type: ignore[name-defined]

@@ -3,6 +3,7 @@
 import contextlib
 import pickle
 import struct
+from pathlib import Path
 
 import formats_fixtures as formats
 import numpy as np
@@ -212,6 +213,26 @@ def test_damaged_preferences_are_no_preferences(tmp_path):
     write_head(own, builtin_head(), step=1e-5)
     head = remember_head(own)
     assert load_head("mine", head.fingerprint).name == "builtin"
+
+
+@pytest.mark.parametrize(
+    ("platform", "variables", "place"),
+    [
+        ("linux", {"XDG_CONFIG_HOME": "/x"}, "/x/pav_blender"),
+        ("linux", {}, "/home/me/.config/pav_blender"),
+        ("darwin", {}, "/home/me/Library/Application Support/pav_blender"),
+        ("win32", {"APPDATA": "/roaming"}, "/roaming/pav_blender"),
+        ("linux", {"PAV_CONFIG": "/mine"}, "/mine"),
+    ],
+)
+def test_where_preferences_lie(platform, variables, place, monkeypatch):
+    for name in ("PAV_CONFIG", "XDG_CONFIG_HOME", "APPDATA"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(preferences.sys, "platform", platform)
+    monkeypatch.setattr(preferences.Path, "home", lambda: Path("/home/me"))
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    assert preferences.folder() == Path(place)
 
 
 def test_an_offset_belongs_to_the_person_not_to_the_model(head):
