@@ -6,10 +6,13 @@ import contextlib
 import os
 import shutil
 import tempfile
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
 from .errors import InputError
+
+_lock = threading.Lock()
 
 
 @contextlib.contextmanager
@@ -67,6 +70,7 @@ def write_text(path: Path | str, text: str) -> None:
 
 
 def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
+    with _lock:  # two threads between these lines would leave the process without a mask
+        mask = os.umask(0)
+        os.umask(mask)
     return mask

@@ -66,7 +66,8 @@ def run(args: argparse.Namespace) -> int:
     head = remember_head(args.head, flame_version=args.flame_version)
     print(
         f"head: {head.name}, {len(head.expression_names)} expressions, "
-        f"{len(head.landmark_triangles)} landmarks, fingerprint {head.fingerprint[:12]}"
+        f"{len(head.landmark_triangles)} landmarks, fingerprint {head.fingerprint[:12]}\n"
+        f"  {head.origin}"
     )
     if not args.sources:
         print("remembered; no sources were named")

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import sparse
-from test_import import Run
+from test_import_hostile import Run
 
 from pav_blender.core import pickles, preferences
 from pav_blender.core.errors import InputError

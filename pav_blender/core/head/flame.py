@@ -36,7 +36,7 @@ COMPANIONS = {
 }
 
 _KEYS = ("v_template", "shapedirs", "posedirs", "J_regressor", "kintree_table", "weights", "f")
-_OTHERS = {6890: "SMPL", 6449: "SMPL", 10475: "SMPL-X", 778: "MANO", 3931: "a cut of FLAME"}
+_OTHERS = {6890: "SMPL", 10475: "SMPL-X", 778: "MANO"}
 
 
 @dataclass(frozen=True)
@@ -103,6 +103,7 @@ def read_flame(files: FlameFiles | Path | str) -> HeadModel:
     triangles, weights, template = arrays["f"], arrays["weights"], arrays["v_template"]
     regressor = arrays["J_regressor"]
     uvs, uv_triangles, notes = read_uvs(files.uvs, template, triangles)
+    notes += f"; regions {f'of {files.masks.name}' if files.masks else 'drawn from its geometry'}"
     drawn = drawn_regions(template, weights, regressor @ template)
     regions = drawn | (masks_of(files.masks, VERTICES) if files.masks else {})
     try:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 
 import numpy as np
 
-from ...errors import Cancelled, InputError
+from ...errors import InputError
 from ...images import read_gray, read_rgba
 from ...progress import Report
 from ..model import LABELS
@@ -24,7 +23,6 @@ def write_person(
     *,
     overwrite: bool = False,
     progress: Report | None = None,
-    should_stop: Callable[[], bool] | None = None,
 ) -> None:
     """Writes the collection, whole or not at all. InputError names a picture that does not fit."""
     extra = {
@@ -51,8 +49,6 @@ def write_person(
                     for job in as_completed(jobs):
                         job.result()
                         done += 1
-                        if should_stop and should_stop():
-                            raise Cancelled("stopped; nothing was written")
                         if progress:
                             progress(done / total, clip=each.clip.name)
                 except BaseException:
