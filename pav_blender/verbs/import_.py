@@ -25,7 +25,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="FLAME's model: a .pkl, a converted .npz, or a folder with one; remembered by its "
         "fingerprint, so that alone it makes a head known on this machine",
     )
-    parser.add_argument("--format", default="auto", help="the sources' format (auto)")
+    parser.add_argument(
+        "--format",
+        default="auto",
+        help="auto (the default), insta, vhap, imavatar, flashavatar, metrical or vhap-track",
+    )
     parser.add_argument(
         "--shapes", default="mean", help="the identity all share: mean (the default) or first"
     )
