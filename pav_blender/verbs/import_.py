@@ -11,7 +11,7 @@ SUMMARY = (
     "Make a collection of what INSTA, metrical-tracker, VHAP, GaussianAvatars, IMavatar or "
     "FlashAvatar wrote; each source is an appearance of one person."
 )
-EXAMPLE = "pav import short=insta/me2019 long=vhap/me2023 --head generic_model.pkl --out out/me"
+EXAMPLE = "pav import short=insta/me2019 long=imavatar/me2023 --head generic_model.pkl --out out/me"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

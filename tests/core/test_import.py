@@ -197,6 +197,8 @@ def test_the_flame_of_a_track_is_checked(tmp_path, heads, make):
             normalise(parsed, heads[other])
         normalise(parsed, heads[other], tracked_with=other)
         normalise(parsed, heads[version])
+        with pytest.raises(InputError, match="one of 2020, 2023"):
+            normalise(parsed, heads[version], tracked_with="2021")
     from pav_blender.core.head import builtin_head
 
     with pytest.raises(InputError, match="is not FLAME"):

@@ -12,7 +12,7 @@ import numpy as np
 
 from ...errors import InputError
 from ...head import HeadModel
-from ...head.flame import EYELIDS, version_of
+from ...head.flame import EYELIDS, VERSIONS, version_of
 from ...images import read_rgba
 from ...progress import Report
 from ..model import Clip
@@ -71,6 +71,8 @@ def normalise(
     """
     if shapes not in SHAPES:
         raise InputError(f"--shapes {shapes!r}: one of {', '.join(SHAPES)}")
+    if tracked_with and tracked_with not in VERSIONS:
+        raise InputError(f"--tracked-with {tracked_with!r}: one of {', '.join(VERSIONS)}")
     for clip in parsed:
         check_version(clip, head, tracked_with)
     names = [clip.name for clip in parsed]
