@@ -69,6 +69,21 @@ def read_rgba(path: Path | str) -> np.ndarray:
     return np.ascontiguousarray(np.concatenate([colour, alpha], axis=2))
 
 
+def read_scene_linear(path: Path | str) -> np.ndarray:
+    """Reads an EXR or HDR picture as float32 [H, W, 4], premultiplied; an absent alpha reads 1.
+
+    Raises InputError for a missing or damaged file.
+    """
+    pixels = _read(path, "float")
+    if pixels.ndim == 2:
+        pixels = pixels[..., None]
+    if pixels.shape[2] < 3:
+        pixels = np.concatenate([np.repeat(pixels[..., :1], 3, axis=2), pixels[..., 1:2]], axis=2)
+    if pixels.shape[2] == 3:
+        pixels = np.concatenate([pixels, np.ones_like(pixels[..., :1])], axis=2)
+    return np.nan_to_num(np.ascontiguousarray(pixels[..., :4], np.float32))
+
+
 def read_gray(path: Path | str) -> np.ndarray:
     """Reads the first channel as it is stored: uint8, uint16 or float32, [H, W]."""
     pixels = _read(path, "native")

@@ -7,7 +7,8 @@ from toy import APPEARANCES
 
 from pav_blender.core.collection import CollectionWriter, read_collection
 from pav_blender.core.errors import InputError
-from pav_blender.core.evaluation.check import check, write_overlays
+from pav_blender.core.evaluation.check import check
+from pav_blender.core.evaluation.review import write_overlays
 from pav_blender.core.images import read_rgba
 
 

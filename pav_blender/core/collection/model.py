@@ -38,7 +38,8 @@ class Clip:
 
     expression [F, E]; pose [F, J, 3] axis-angle, radians; translation [F, 3] metres; intrinsics
     [F, 3, 3] pixels; camera_to_world [F, 4, 4], OpenCV axes; frame_id [F] int32, the number in the
-    picture's name; split [F], one of SPLITS; vertices [F, V, 3] metres or None (posed parameters).
+    picture's name; split [F], one of SPLITS; vertices [F, V, 3] metres or None (posed parameters);
+    landmarks [F, L, 2] pixels as the tracker saw them, or None.
     """
 
     name: str
@@ -53,6 +54,7 @@ class Clip:
     frame_id: np.ndarray
     split: np.ndarray
     vertices: np.ndarray | None = None
+    landmarks: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.frame_id)

@@ -112,6 +112,8 @@ def _read_clip(
     }
     if "vertices" in arrays:
         shapes["vertices"] = (count, vertices, 3)
+    if "landmarks" in arrays:
+        shapes["landmarks"] = (count, len(head.landmark_triangles), 2)
     for key, shape in shapes.items():
         if key not in arrays:
             raise InputError(f"{path}: the array {key!r} is missing")
@@ -145,4 +147,5 @@ def _read_clip(
         frame_id=arrays["frame_id"].astype(np.int32),
         split=arrays["split"],
         vertices=arrays.get("vertices"),
+        landmarks=arrays.get("landmarks"),
     )

@@ -128,6 +128,8 @@ class CollectionWriter:
         }
         if clip.vertices is not None:
             arrays["vertices"] = np.asarray(clip.vertices, np.float32)
+        if clip.landmarks is not None:
+            arrays["landmarks"] = np.asarray(clip.landmarks, np.float32)
         folder = self.root / "clips" / clip.name
         folder.mkdir(parents=True, exist_ok=True)
         with replacing(folder / "frames.npz") as temporary, open(temporary, "wb") as stream:

@@ -1,21 +1,15 @@
-"""Looking a collection over: what it holds, what is wrong, and the mesh laid over its pictures."""
+"""Looking a collection over: what it holds, and what is wrong."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 
 from ..collection import Clip, Collection
 from ..errors import InputError
-from ..images import write_rgba
 from ..progress import Report
-from ..rendering.rasterise import rasterise
 from ..training.frames import camera_of, load_picture
-from .sheet import grid
-
-_OVERLAYS = 6  # frames a clip
 
 
 @dataclass
@@ -77,24 +71,3 @@ def _mesh_in_matte(collection: Collection, clip: Clip, row: int, rgba: np.ndarra
     if not inside.any():
         return 0.0
     return float((rgba[at[inside, 1], at[inside, 0], 3] > 64).mean())
-
-
-def overlay(collection: Collection, clip: Clip, row: int) -> np.ndarray:
-    """The picture with the mesh's triangle edges on it, float32 [H, W, 4] in [0, 1]."""
-    rgba = load_picture(collection, clip, row).astype(np.float32) / 255
-    shown = rgba[..., :3] * rgba[..., 3:] + 0.25 * (1 - rgba[..., 3:])
-    vertices = collection.posed(clip, np.array([row]))[0]
-    camera = camera_of(clip, row)
-    _, triangle, barycentric = rasterise(vertices, collection.head.triangles, camera)
-    edge = (triangle >= 0) & (barycentric.min(-1) < 0.06)
-    shown[edge] = 0.45 * shown[edge] + 0.55 * np.array([0.2, 0.9, 0.5])
-    return np.concatenate([shown, np.ones_like(shown[..., :1])], 2).astype(np.float32)
-
-
-def write_overlays(collection: Collection, path: Path) -> None:
-    """A sheet: a row a clip, up to six frames spread over it."""
-    rows = []
-    for clip in collection.clips:
-        at = np.linspace(0, len(clip) - 1, min(_OVERLAYS, len(clip))).round().astype(int)
-        rows.append([overlay(collection, clip, int(row)) for row in at])
-    write_rgba(path, grid(rows))

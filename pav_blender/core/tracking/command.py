@@ -7,27 +7,38 @@ import sys
 from pathlib import Path
 
 from ..progress import Progress
-from .track import ShouldStop, track
+from .sift import ranges
+from .track import track
+from .write import ShouldStop
 
-HELP = "videos of one person -> a collection: landmarks, head fit, crop, matte"
-EXAMPLE = "pav track morning.mp4 evening.mp4 --out me --appearance plain --appearance glasses"
+HELP = "videos or picture folders of one person -> a collection: landmarks, head fit, crop, matte"
+EXAMPLE = "pav track 2019.mp4 2023a.mp4 2023b/ --out me --appearance beard=2023a,2023b"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the verb's arguments to its parser."""
-    parser.add_argument("videos", nargs="+", type=Path, metavar="VIDEO", help="clips of one person")
+    parser.add_argument(
+        "videos",
+        nargs="+",
+        type=Path,
+        metavar="VIDEO",
+        help="clips of one person: video files, or folders of pictures in natural order",
+    )
     parser.add_argument("--out", required=True, type=Path, help="the collection folder to write")
     parser.add_argument("--size", type=int, default=256, help="side of the pictures (256)")
-    parser.add_argument("--every", type=int, default=1, help="use every N-th frame (1)")
+    parser.add_argument("--every", type=int, default=1, help="look at every N-th frame (1)")
     parser.add_argument(
-        "--max-frames", type=int, default=1000, help="frames a video at most (1000)"
+        "--max-frames",
+        type=int,
+        default=500,
+        help="frames a clip at most, as different in turn and expression as can be (500)",
     )
     parser.add_argument(
         "--appearance",
         action="append",
-        metavar="NAME",
-        help="what the person looks like in a video, once a video in their order; videos may share "
-        "one (default: the file names)",
+        metavar="NAME=CLIP,CLIP",
+        help="what the person looks like in these clips (named as their files are); or just a "
+        "name, once a video in their order (default: an appearance a video)",
     )
     parser.add_argument("--head", default="builtin", help="builtin, or a head file")
     parser.add_argument(
@@ -41,6 +52,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=("segment", "none"),
         default="segment",
         help="cut the person out, or keep the pictures opaque",
+    )
+    parser.add_argument(
+        "--cuts",
+        choices=("split", "keep"),
+        default="split",
+        help="split a video where it was cut, each shot becoming a clip, or take it as one",
     )
     parser.add_argument("--overwrite", action="store_true", help="replace an older collection")
 
@@ -57,6 +74,7 @@ def run(args: argparse.Namespace, should_stop: ShouldStop | None = None) -> int:
         head=args.head,
         model=args.landmark_model,
         cut_background=args.matte == "segment",
+        cuts=args.cuts == "split",
         overwrite=args.overwrite,
         progress=Progress("track", as_json=getattr(args, "json_progress", False)),
         should_stop=should_stop,
@@ -67,18 +85,11 @@ def run(args: argparse.Namespace, should_stop: ShouldStop | None = None) -> int:
         print(
             f"{clip['name']}: {clip['frames']} frames, landmarks within "
             f"{clip['error_percent']:.2f} % of the eye distance"
-            + (f"; left out {_ranges(clip['left_out'])}" if clip["left_out"] else "")
+            + (f"; {clip['not_chosen']} more of use" if clip["not_chosen"] else "")
         )
+        for reason, numbers in clip["left_out"].items():
+            print(f"  left out, {reason}: {ranges(numbers)}")
+    for shot in report.skipped:
+        print(f"{shot['video']}: frames {shot['first']}-{shot['last']} left out, {shot['reason']}")
     print(f"wrote {report.path}")
     return 0
-
-
-def _ranges(numbers: list[int]) -> str:
-    """[1, 2, 3, 7] -> '1-3, 7'."""
-    parts: list[list[int]] = []
-    for number in numbers:
-        if parts and number == parts[-1][1] + 1:
-            parts[-1][1] = number
-        else:
-            parts.append([number, number])
-    return ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in parts)

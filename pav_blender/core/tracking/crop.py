@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from ..errors import InputError
-from .observe import Observations
+
+if TYPE_CHECKING:
+    from .observe import Observations
 
 # of the face's size (forehead to chin, or as wide where the head is turned): how far the window
 # should reach above the forehead's landmarks, below the chin and to the sides; and what it must
@@ -60,22 +63,31 @@ def resize(picture: np.ndarray, size: int) -> np.ndarray:
     return resized[0].permute(1, 2, 0).contiguous().numpy()
 
 
-def content_box(samples: np.ndarray) -> tuple[int, int, int, int]:
-    """left, top, right, bottom of the picture inside its black bars; samples uint8 [N, H, W, 3].
+_ACROSS = 64  # columns (rows) looked at for bars above and below (at the sides)
 
-    A bar is dark, the same all along and in every sample, and ends in a sharp line.
+
+def edges(rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What `content_box` needs of a frame [H, W, 3]: grey [H, 64] and, turned, [W, 64], uint8."""
+    height, width = rgb.shape[:2]
+    tall = rgb[:, np.linspace(0, width - 1, _ACROSS).astype(int)]
+    wide = rgb[np.linspace(0, height - 1, _ACROSS).astype(int)].transpose(1, 0, 2)
+    return tuple((strip.mean(axis=2) + 0.5).astype(np.uint8) for strip in (tall, wide))
+
+
+def content_box(tall: np.ndarray, wide: np.ndarray) -> tuple[int, int, int, int]:
+    """left, top, right, bottom of the picture inside its black bars.
+
+    tall [N, H, 64], wide [N, W, 64]: of N frames, see `edges`. A bar is dark, the same all along
+    and in every frame, and ends in a sharp line.
     """
-    grey = samples.astype(np.float32).mean(axis=-1)
-    top = _bar(grey)
-    bottom = _bar(grey[:, ::-1])
-    left = _bar(grey.transpose(0, 2, 1))
-    right = _bar(grey.transpose(0, 2, 1)[:, ::-1])
-    height, width = grey.shape[1:]
-    return left, top, width - right, height - bottom
+    tall, wide = tall.astype(np.float32), wide.astype(np.float32)
+    right = wide.shape[1] - _bar(wide[:, ::-1])
+    bottom = tall.shape[1] - _bar(tall[:, ::-1])
+    return _bar(wide), _bar(tall), right, bottom
 
 
 def _bar(grey: np.ndarray) -> int:
-    """Rows of a bar at the top of [N, H, W]."""
+    """Rows of a bar at the top of [N, H, 64]."""
     limit = grey.shape[1] // 3
     colour = float(np.median(grey[:, 0]))
     if colour > 48:

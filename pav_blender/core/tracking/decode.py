@@ -1,4 +1,7 @@
-"""Video files to pictures, one at a time, upright and with square pixels."""
+"""Video files to pictures, one at a time, upright and with square pixels.
+
+`Video` and `pictures.PictureFolder` are both a `Source`.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +9,12 @@ import importlib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from ..errors import InputError
+from .cache import fingerprint
 
 _COVER_PICTURE = 0x400  # libavformat's AV_DISPOSITION_ATTACHED_PIC
 
@@ -23,57 +27,75 @@ class Frame:
     rgb: np.ndarray
 
 
+class Source(Protocol):
+    """Where frames come from. rate: frames a second (0: not known); count: frames as declared
+    (0: not known); warnings: one line for each thing that could not be decoded."""
+
+    path: Path
+    rate: float
+    warnings: list[str]
+
+    @property
+    def count(self) -> int: ...
+
+    def frames(self, every: int = 1, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
+        """Frames 0, every, 2 every, ... of those numbered from `start` to before `stop`."""
+        ...
+
+    def fingerprint(self) -> str:
+        """Tells contents apart."""
+        ...
+
+
 @dataclass
 class Video:
-    """An opened description of a video; `frames` reads it anew each time.
-
-    rate: frames a second (0 where the file does not say); count: frames as the file declares them
-    (0: unknown); warnings: one line for each thing that could not be decoded.
-    """
+    """An opened description of a video; `frames` reads it anew each time. See `Source`."""
 
     path: Path
     rate: float
     count: int
     warnings: list[str] = field(default_factory=list)
 
-    def frames(self, every: int = 1, max_frames: int | None = None) -> Iterator[Frame]:
-        """Yields every `every`-th frame, `max_frames` at most.
-
-        What is damaged is passed over and told in `warnings`; a file in which nothing can be
-        decoded raises InputError.
-        """
-        given, number, skipped = 0, 0, 0
+    def frames(self, every: int = 1, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
+        """See `Source`. What is damaged is passed over and told in `warnings`; a file in which
+        nothing can be decoded raises InputError."""
+        number, skipped = 0, 0
         ended_early = False
         size: tuple[int, ...] | None = None
         with _open(self.path) as container:
             stream = _video_stream(container, self.path)
             ratio = _pixel_aspect(stream)
-            packets = _packets(container, stream)
-            for packet in packets:
+            for packet in _packets(container, stream):
                 if packet is None:
                     ended_early = True
                     break
                 for picture in _decoded(packet):
+                    if stop is not None and number >= stop:
+                        return
                     if picture is None:
                         skipped += 1
                         continue
-                    wanted = number % every == 0
                     number += 1
-                    if not wanted:
+                    # the first one always, for its size is the clip's
+                    if size is not None and (number <= start or (number - 1) % every):
                         continue
                     rgb = _upright(picture, ratio)
                     size = size or rgb.shape
                     if rgb.shape != size:
                         skipped += 1
-                        continue
-                    yield Frame(number - 1, rgb)
-                    given += 1
-                    if max_frames is not None and given >= max_frames:
-                        return
-        if given == 0:
+                    elif number > start and (number - 1) % every == 0:
+                        yield Frame(number - 1, rgb)
+        if number == 0:
             raise InputError(f"{self.path}: no picture in it can be decoded")
         if skipped or ended_early or number < self.count:
-            self._warn(f"{self.path}: damaged or cut short; {number} frames could be decoded")
+            self._warn(
+                f"{self.path}: damaged or cut short; {number} "
+                + (f"of {self.count} " if self.count > number else "")
+                + "frames could be decoded"
+            )
+
+    def fingerprint(self) -> str:
+        return fingerprint([self.path])
 
     def _warn(self, line: str) -> None:
         if line not in self.warnings:

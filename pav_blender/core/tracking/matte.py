@@ -15,7 +15,7 @@ import torch
 from torch.nn import functional
 
 from ..errors import InputError
-from .observe import INSTALL, load_mediapipe, quiet
+from .detectors import INSTALL, load_mediapipe, quiet
 
 MASK_SIDE = 256
 _FLOOR = 0.2  # the network's edge is softer than hair is, and never quite sure
@@ -55,6 +55,11 @@ class Segmenter:
     def close(self) -> None:
         with quiet():
             self._network.close()
+
+
+def segmenter_name() -> str:
+    """Tells this segmenter's masks apart from others'."""
+    return f"selfie general, mediapipe {getattr(load_mediapipe(), '__version__', 'unknown')}"
 
 
 def steadied(masks: np.ndarray) -> np.ndarray:

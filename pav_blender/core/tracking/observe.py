@@ -1,22 +1,28 @@
-"""Facial landmarks of a video's frames, by MediaPipe, which is an optional dependency."""
+"""What is seen in the frames of a video: faces, hands, and what tells good frames from bad."""
 
 from __future__ import annotations
 
-import contextlib
-import importlib
-import os
-from collections.abc import Callable, Iterable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Protocol
+from itertools import islice
 
 import numpy as np
 
 from ..errors import Cancelled, InputError
-from .decode import Frame
+from .cache import Cache
+from .crop import edges, resize
+from .decode import Frame, Source
+from .detectors import HAND_POINTS, HANDS, Detector, HandDetector
 
 LANDMARKS = 478
-INSTALL = "`pip install mediapipe==0.10.21` (Python 3.9 to 3.12)"
+# frames looked at between two savings; detectors begin anew with each, some frames early, so that
+# what is found does not depend on where the work was once interrupted
+CHUNK, _WARMING = 256, 12
+_BORDERS_AT = (0, 2, 4, 8, 16, 32, 64, 128, 192)  # of a chunk
+_THUMB = 16
+_FACE_SIDE = 96
+_HAND_SIDE = 640  # pixels of the longer side are enough to find hands
 
 
 @dataclass(eq=False)
@@ -54,172 +60,231 @@ class Observations:
         )
 
 
-class Detector(Protocol):
-    """Finds a face: uint8 [H, W, 3] -> landmarks [478, 3] in [0, 1] of the picture, and scores."""
+@dataclass(eq=False)
+class Sightings:
+    """Everything that is seen in the N frames of a source, before anyone has chosen.
 
+    frame_id [N] int32; thumbs [N, 16, 16, 3] uint8; hands [N, 2, 21, 2] float32 pixels, NaN where
+    there is none. Of the K faces, by rising frame: row [K] of their frame, landmarks [K, 478, 3],
+    scores [K, 52] or [K, 0], sharpness [K] (see `sharpness`). tall, wide: see `crop.edges`.
+    """
+
+    frame_id: np.ndarray
+    thumbs: np.ndarray
+    hands: np.ndarray
+    row: np.ndarray
+    landmarks: np.ndarray
+    scores: np.ndarray
+    sharpness: np.ndarray
+    tall: np.ndarray
+    wide: np.ndarray
     score_names: tuple[str, ...]
+    width: int
+    height: int
 
-    def __call__(self, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray | None] | None: ...
+    def observations(self, faces: np.ndarray) -> Observations:
+        """The faces with the numbers `faces`, one a frame; the other frames count as missing."""
+        rows = self.row[faces]
+        missing = np.delete(self.frame_id, rows).tolist()
+        return Observations(
+            self.landmarks[faces],
+            self.scores[faces] if self.scores.shape[1] else None,
+            self.score_names,
+            self.frame_id[rows],
+            missing,
+            self.width,
+            self.height,
+        )
 
-    def close(self) -> None: ...
+
+_ARRAYS = ("frame_id", "thumbs", "hands", "row", "landmarks", "scores", "sharpness")
+_STORED = (*_ARRAYS, "tall", "wide", "score_names", "size", "more", "warnings")
 
 
 def observe(
-    frames: Iterable[Frame],
-    detector: Detector,
+    source: Source,
+    every: int,
+    make_detectors: Callable[[], tuple[Detector, HandDetector | None]],
     *,
-    name: str,
-    on_frame: Callable[[Frame], None] | None = None,
+    cache: Cache,
+    key: str,
+    tell: Callable[[int], None] | None = None,
     should_stop: Callable[[], bool] | None = None,
-) -> Observations:
-    """Runs `detector` over the frames. Raises InputError naming the video if no face is in it."""
-    found, scores, ids, missing = [], [], [], []
-    height = width = 0
-    for frame in frames:
+) -> Sightings:
+    """Looks at every `every`-th frame of `source`; `tell` hears how many are done.
+
+    What `cache` has under `key` is not looked at again. Raises InputError naming the video where
+    there is no face in it, and Cancelled; what is done by then is in the cache.
+    """
+    chunks: list[dict[str, np.ndarray]] = []
+    while not chunks or chunks[-1]["more"]:
+        found = cache.load(key, f"seen{len(chunks):05d}", _STORED)
+        if found is None:
+            break
+        chunks.append(found)
+    if chunks and not chunks[-1]["more"]:
+        source.warnings.extend(w for w in chunks[-1]["warnings"].tolist())
+    else:
+        last = chunks[-1]["frame_id"][-_WARMING:].tolist() if chunks else []
+        frames = source.frames(every, last[0] if last else 0)
+        recent = deque(islice(frames, len(last)), _WARMING)
+        while not chunks or chunks[-1]["more"]:
+            if should_stop is not None and should_stop():
+                raise _stopped()
+            detectors = make_detectors()
+            try:
+                chunk = _chunk(
+                    recent, frames, detectors, _counting(tell, len(chunks) * CHUNK), should_stop
+                )
+            finally:
+                for detector in detectors:
+                    if detector is not None:
+                        detector.close()
+            chunk["warnings"] = np.array(source.warnings, dtype=np.str_)
+            cache.store(key, f"seen{len(chunks):05d}", chunk)
+            chunks.append(chunk)
+    return _joined(chunks, source)
+
+
+def _counting(tell: Callable[[int], None] | None, done: int) -> Callable[[int], None]:
+    return lambda count: tell(done + count) if tell else None
+
+
+def _chunk(
+    recent: deque[Frame],
+    frames: Iterator[Frame],
+    detectors: tuple[Detector, HandDetector | None],
+    tell: Callable[[int], None],
+    should_stop: Callable[[], bool] | None,
+) -> dict[str, np.ndarray]:
+    """The next CHUNK frames, after a second look at the `recent` ones, which it renews."""
+    detector, hand_detector = detectors
+    for frame in recent:
+        _faces(detector, frame.rgb)
+        _hands(hand_detector, frame.rgb)
+    lists: dict[str, list] = {name: [] for name in (*_ARRAYS, "tall", "wide")}
+    size: tuple[int, ...] = (0, 0)
+    count = 0
+    for frame in islice(frames, CHUNK):
         if should_stop is not None and should_stop():
-            raise Cancelled("tracking stopped; nothing was written")
-        height, width = frame.rgb.shape[:2]
-        side = max(height, width)
-        # the landmark model's region maths holds for square pictures only
-        square = np.zeros((side, side, 3), np.uint8)
-        square[:height, :width] = frame.rgb
-        result = detector(square)
-        if result is None or not np.isfinite(result[0]).all():
-            missing.append(frame.number)
-        else:
-            found.append(result[0] * side)
-            scores.append(result[1])
-            ids.append(frame.number)
-        if on_frame is not None:
-            on_frame(frame)
-    if not found:
+            raise _stopped()
+        size = frame.rgb.shape[:2]
+        lists["frame_id"].append(frame.number)
+        lists["thumbs"].append(_thumb(frame.rgb))
+        lists["hands"].append(_hands(hand_detector, frame.rgb))
+        for landmarks, scores in _faces(detector, frame.rgb):
+            lists["row"].append(count)
+            lists["landmarks"].append(landmarks)
+            lists["scores"].append(np.zeros(0, np.float32) if scores is None else scores)
+            lists["sharpness"].append(sharpness(frame.rgb, landmarks))
+        if count in _BORDERS_AT:
+            tall, wide = edges(frame.rgb)
+            lists["tall"].append(tall)
+            lists["wide"].append(wide)
+        recent.append(frame)
+        count += 1
+        tell(count)
+    arrays = {name: np.asarray(values) for name, values in lists.items()}
+    names = detector.score_names
+    # a scripted or a failing network may score some faces only
+    if len({len(scores) for scores in lists["scores"]}) > 1:
+        arrays["scores"], names = np.zeros((len(lists["row"]), 0), np.float32), ()
+    return {
+        **arrays,
+        "score_names": np.array(names, dtype=np.str_),
+        "size": np.array(size),
+        "more": np.array(count == CHUNK),
+    }
+
+
+def _joined(chunks: list[dict[str, np.ndarray]], source: Source) -> Sightings:
+    starts = np.cumsum([0, *[len(chunk["frame_id"]) for chunk in chunks]])
+    filled = [(start, c) for start, c in zip(starts, chunks, strict=False) if len(c["frame_id"])]
+    if not any(len(chunk["row"]) for _, chunk in filled):
         raise InputError(
-            f"{name}: no face was found in any of its {len(missing)} frames; "
+            f"{source.path}: no face was found in any of its {starts[-1]} frames; "
             "use a video in which the face is visible"
         )
-    scored = detector.score_names and all(row is not None for row in scores)
-    return Observations(
-        np.asarray(found, np.float32),
-        np.asarray(scores, np.float32) if scored else None,
-        detector.score_names if scored else (),
-        np.asarray(ids, np.int32),
-        missing,
+    faces = [(start, chunk) for start, chunk in filled if len(chunk["row"])]
+    scored = {chunk["scores"].shape[1] for _, chunk in faces}
+    height, width = filled[0][1]["size"].tolist()
+
+    def all_of(name: str) -> np.ndarray:
+        return np.concatenate([chunk[name] for _, chunk in filled])
+
+    def of_faces(name: str) -> np.ndarray:
+        return np.concatenate([chunk[name] for _, chunk in faces]).astype(np.float32)
+
+    return Sightings(
+        all_of("frame_id").astype(np.int32),
+        all_of("thumbs"),
+        all_of("hands"),
+        np.concatenate([chunk["row"] + start for start, chunk in faces]).astype(np.int64),
+        of_faces("landmarks"),
+        of_faces("scores") if len(scored) == 1 else np.zeros((len(of_faces("sharpness")), 0)),
+        of_faces("sharpness"),
+        all_of("tall"),
+        all_of("wide"),
+        tuple(faces[0][1]["score_names"].tolist()) if len(scored) == 1 else (),
         width,
         height,
     )
 
 
-def make_detector(task_file: Path | str | None = None) -> Detector:
-    """The best detector this Python has; with a `.task` file one that scores expressions too.
-
-    Raises InputError where MediaPipe is missing, or carries no model and no file is given.
-    """
-    mediapipe = load_mediapipe()
-    if task_file is not None:
-        return _TaskDetector(mediapipe, Path(task_file))
-    if getattr(mediapipe, "solutions", None) is None:
-        raise InputError(
-            f"mediapipe {mediapipe.__version__} carries no face model: give one with "
-            f"--landmark-model face_landmarker.task, or {INSTALL}"
-        )
-    return _BundledDetector(mediapipe)
+def _faces(detector: Detector, rgb: np.ndarray) -> list[tuple[np.ndarray, np.ndarray | None]]:
+    """Landmarks in pixels, and scores, of each face."""
+    height, width = rgb.shape[:2]
+    side = max(height, width)
+    # the landmark model's region maths holds for square pictures only
+    square = np.zeros((side, side, 3), np.uint8)
+    square[:height, :width] = rgb
+    return [
+        ((face.landmarks * side).astype(np.float32), face.scores)
+        for face in detector(square)
+        if np.isfinite(face.landmarks).all()
+    ]
 
 
-def load_mediapipe() -> Any:
-    """Imports MediaPipe quietly. Raises InputError with what to install where it is absent."""
-    os.environ.setdefault("GLOG_minloglevel", "2")
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
-    try:
-        with quiet():
-            return importlib.import_module("mediapipe")
-    except ImportError as error:
-        raise InputError(f"tracking needs MediaPipe, which is missing: {INSTALL}") from error
+def _hands(detector: HandDetector | None, rgb: np.ndarray) -> np.ndarray:
+    """[2, 21, 2] pixels, NaN where there is no hand."""
+    found = np.full((HANDS, HAND_POINTS, 2), np.nan, np.float32)
+    if detector is not None:
+        height, width = rgb.shape[:2]
+        step = max(1, max(height, width) // _HAND_SIDE)
+        hands = detector(np.ascontiguousarray(rgb[::step, ::step]))[:HANDS]
+        found[: len(hands)] = hands * np.array([width, height], np.float32)
+    return found
 
 
-@contextlib.contextmanager
-def quiet() -> Iterator[None]:
-    """Drops what native code prints on standard error; MediaPipe has no switch for it."""
-    try:
-        saved = os.dup(2)
-    except OSError:  # no standard error, as in some windowed programs
-        yield
-        return
-    sink = os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(sink, 2)
-        yield
-    finally:
-        os.dup2(saved, 2)
-        os.close(saved)
-        os.close(sink)
+def sharpness(rgb: np.ndarray, landmarks: np.ndarray) -> float:
+    """How much fine detail the face has: the variance of its Laplacian over its own variance, at
+    one size for all faces. Comparable within a clip only."""
+    low = landmarks[:, :2].min(axis=0).clip(0).astype(int)
+    high = landmarks[:, :2].max(axis=0).astype(int) + 1
+    window = rgb[low[1] : high[1], low[0] : high[0]]
+    side = min(window.shape[:2])
+    if side < 8:
+        return 0.0
+    top, left = (np.array(window.shape[:2]) - side) // 2
+    square = window[top : top + side, left : left + side].astype(np.float32).mean(axis=2)
+    grey = resize(np.ascontiguousarray(square[..., None]), _FACE_SIDE)[..., 0]
+    inner = grey[1:-1, 1:-1]
+    laplacian = grey[:-2, 1:-1] + grey[2:, 1:-1] + grey[1:-1, :-2] + grey[1:-1, 2:] - 4 * inner
+    return float(laplacian.var() / (inner.var() + 1.0))
 
 
-def _points(landmarks: Any) -> np.ndarray:
-    return np.array([(point.x, point.y, point.z) for point in landmarks], np.float32)
+def _thumb(rgb: np.ndarray) -> np.ndarray:
+    """uint8 [16, 16, 3]: means of blocks, of a raster where the picture is large."""
+    height, width = rgb.shape[:2]
+    step = max(1, min(height, width) // 128)
+    small = rgb[::step, ::step]
+    if min(small.shape[:2]) < _THUMB:
+        small = np.repeat(np.repeat(small, _THUMB, axis=0), _THUMB, axis=1)
+    rows, columns = (length // _THUMB for length in small.shape[:2])
+    cut = small[: rows * _THUMB, : columns * _THUMB].astype(np.float32)
+    means = cut.reshape(_THUMB, rows, _THUMB, columns, 3).mean(axis=(1, 3))
+    return (means + 0.5).astype(np.uint8)
 
 
-class _BundledDetector:
-    """`mp.solutions.face_mesh`, whose models lie in the wheel; no expression scores."""
-
-    score_names: tuple[str, ...] = ()
-
-    def __init__(self, mediapipe: Any) -> None:
-        with quiet():
-            self._mesh = mediapipe.solutions.face_mesh.FaceMesh(
-                static_image_mode=False, max_num_faces=1, refine_landmarks=True
-            )
-            # its threads start, and chatter, with the first picture
-            self._mesh.process(np.zeros((64, 64, 3), np.uint8))
-
-    def __call__(self, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray | None] | None:
-        with quiet():
-            faces = self._mesh.process(rgb).multi_face_landmarks
-        return (_points(faces[0].landmark), None) if faces else None
-
-    def close(self) -> None:
-        with quiet():
-            self._mesh.close()
-
-
-class _TaskDetector:
-    """The Tasks API with a face landmarker file: landmarks and 52 blend shape scores."""
-
-    def __init__(self, mediapipe: Any, path: Path) -> None:
-        if not path.is_file():
-            raise InputError(f"{path}: no such landmark model file")
-        vision = importlib.import_module("mediapipe.tasks.python.vision")
-        base = importlib.import_module("mediapipe.tasks.python").BaseOptions
-        self._image, self._format = mediapipe.Image, mediapipe.ImageFormat.SRGB
-        self.score_names: tuple[str, ...] = ()
-        try:
-            with quiet():
-                # every frame on its own: the video mode's smoothing lags behind lips and lids
-                self._landmarker = vision.FaceLandmarker.create_from_options(
-                    vision.FaceLandmarkerOptions(
-                        base_options=base(model_asset_buffer=path.read_bytes()),
-                        running_mode=vision.RunningMode.IMAGE,
-                        num_faces=1,
-                        output_face_blendshapes=True,
-                    )
-                )
-        except (RuntimeError, ValueError) as error:
-            raise InputError(f"{path}: not a face landmarker model ({_line(error)})") from error
-
-    def __call__(self, rgb: np.ndarray) -> tuple[np.ndarray, np.ndarray | None] | None:
-        with quiet():
-            result = self._landmarker.detect(self._image(image_format=self._format, data=rgb))
-        if not result.face_landmarks:
-            return None
-        shapes = result.face_blendshapes[0] if result.face_blendshapes else []
-        shapes = [shape for shape in shapes if shape.category_name != "_neutral"]
-        self.score_names = tuple(shape.category_name for shape in shapes)
-        scores = np.array([shape.score for shape in shapes], np.float32) if shapes else None
-        return _points(result.face_landmarks[0]), scores
-
-    def close(self) -> None:
-        with quiet():
-            self._landmarker.close()
-
-
-def _line(error: Exception) -> str:
-    return (str(error).splitlines() or ["no reason given"])[0]
+def _stopped() -> Cancelled:
+    return Cancelled("tracking stopped; the same command goes on from here")

@@ -1,0 +1,202 @@
+"""MediaPipe, an optional dependency: where faces are in a picture, and hands."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import importlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from ..errors import InputError
+
+INSTALL = "`pip install mediapipe==0.10.21` (Python 3.9 to 3.12)"
+FACES, HANDS, HAND_POINTS = 4, 2, 21  # so many at most
+
+
+class Face(NamedTuple):
+    """landmarks float32 [478, 3] in [0, 1] of the (square) picture; scores [52] or None."""
+
+    landmarks: np.ndarray
+    scores: np.ndarray | None
+
+
+class Detector(Protocol):
+    """Finds faces in uint8 [S, S, 3]; score_names: of the scores, known after the first face."""
+
+    score_names: tuple[str, ...]
+
+    def __call__(self, rgb: np.ndarray) -> list[Face]: ...
+
+    def close(self) -> None: ...
+
+
+class HandDetector(Protocol):
+    """Finds hands in uint8 [H, W, 3]: [n, 21, 2] in [0, 1] of the picture."""
+
+    def __call__(self, rgb: np.ndarray) -> np.ndarray: ...
+
+    def close(self) -> None: ...
+
+
+def make_detector(task_file: Path | str | None = None) -> Detector:
+    """The best detector this Python has; with a `.task` file one that scores expressions too.
+
+    Raises InputError where MediaPipe is missing, or carries no model and no file is given.
+    """
+    mediapipe = load_mediapipe()
+    if task_file is not None:
+        return _TaskDetector(mediapipe, Path(task_file))
+    if getattr(mediapipe, "solutions", None) is None:
+        raise InputError(
+            f"mediapipe {mediapipe.__version__} carries no face model: give one with "
+            f"--landmark-model face_landmarker.task, or {INSTALL}"
+        )
+    return _BundledDetector(mediapipe)
+
+
+def load_mediapipe() -> Any:
+    """Imports MediaPipe quietly. Raises InputError with what to install where it is absent."""
+    os.environ.setdefault("GLOG_minloglevel", "2")
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
+    try:
+        with quiet():
+            return importlib.import_module("mediapipe")
+    except ImportError as error:
+        raise InputError(f"tracking needs MediaPipe, which is missing: {INSTALL}") from error
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Drops what native code prints on standard error; MediaPipe has no switch for it."""
+    try:
+        saved = os.dup(2)
+    except OSError:  # no standard error, as in some windowed programs
+        yield
+        return
+    sink = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(sink, 2)
+        yield
+    finally:
+        os.dup2(saved, 2)
+        os.close(saved)
+        os.close(sink)
+
+
+def _points(landmarks: Any) -> np.ndarray:
+    return np.array([(point.x, point.y, point.z) for point in landmarks], np.float32)
+
+
+def finds_hands() -> bool:
+    """Whether `make_hand_detector` makes one."""
+    return getattr(load_mediapipe(), "solutions", None) is not None
+
+
+def make_hand_detector() -> HandDetector | None:
+    """MediaPipe's hands, whose models lie in the 0.10 wheel; None where they do not."""
+    return _Hands(load_mediapipe()) if finds_hands() else None
+
+
+def detector_name(task_file: Path | str | None) -> str:
+    """Tells what `make_detector` makes apart from what other versions and files make."""
+    version = getattr(load_mediapipe(), "__version__", "unknown")
+    if task_file is None or not Path(task_file).is_file():
+        return f"mediapipe {version}"
+    return f"mediapipe {version} {hashlib.sha256(Path(task_file).read_bytes()).hexdigest()}"
+
+
+class _Hands:
+    """`mp.solutions.hands`. It follows a hand from picture to picture: a hand that lies on a face
+    is seldom found afresh, but seldom lost."""
+
+    def __init__(self, mediapipe: Any) -> None:
+        with quiet():
+            self._hands = mediapipe.solutions.hands.Hands(
+                static_image_mode=False, max_num_hands=HANDS, model_complexity=0
+            )
+            self._hands.process(np.zeros((64, 64, 3), np.uint8))
+
+    def __call__(self, rgb: np.ndarray) -> np.ndarray:
+        with quiet():
+            found = self._hands.process(rgb).multi_hand_landmarks or []
+        return np.stack([_points(hand.landmark)[:, :2] for hand in found]) if found else _NO_HANDS
+
+    def close(self) -> None:
+        with quiet():
+            self._hands.close()
+
+
+_NO_HANDS = np.zeros((0, HAND_POINTS, 2), np.float32)
+
+
+class _BundledDetector:
+    """`mp.solutions.face_mesh`, whose models lie in the wheel; no expression scores."""
+
+    score_names: tuple[str, ...] = ()
+
+    def __init__(self, mediapipe: Any) -> None:
+        with quiet():
+            self._mesh = mediapipe.solutions.face_mesh.FaceMesh(
+                static_image_mode=False, max_num_faces=FACES, refine_landmarks=True
+            )
+            # its threads start, and chatter, with the first picture
+            self._mesh.process(np.zeros((64, 64, 3), np.uint8))
+
+    def __call__(self, rgb: np.ndarray) -> list[Face]:
+        with quiet():
+            faces = self._mesh.process(rgb).multi_face_landmarks or []
+        return [Face(_points(face.landmark), None) for face in faces]
+
+    def close(self) -> None:
+        with quiet():
+            self._mesh.close()
+
+
+class _TaskDetector:
+    """The Tasks API with a face landmarker file: landmarks and 52 blend shape scores."""
+
+    def __init__(self, mediapipe: Any, path: Path) -> None:
+        if not path.is_file():
+            raise InputError(f"{path}: no such landmark model file")
+        vision = importlib.import_module("mediapipe.tasks.python.vision")
+        base = importlib.import_module("mediapipe.tasks.python").BaseOptions
+        self._image, self._format = mediapipe.Image, mediapipe.ImageFormat.SRGB
+        self.score_names: tuple[str, ...] = ()
+        try:
+            with quiet():
+                # every frame on its own: the video mode's smoothing lags behind lips and lids
+                self._landmarker = vision.FaceLandmarker.create_from_options(
+                    vision.FaceLandmarkerOptions(
+                        base_options=base(model_asset_buffer=path.read_bytes()),
+                        running_mode=vision.RunningMode.IMAGE,
+                        num_faces=FACES,
+                        output_face_blendshapes=True,
+                    )
+                )
+        except (RuntimeError, ValueError) as error:
+            raise InputError(f"{path}: not a face landmarker model ({_line(error)})") from error
+
+    def __call__(self, rgb: np.ndarray) -> list[Face]:
+        with quiet():
+            result = self._landmarker.detect(self._image(image_format=self._format, data=rgb))
+        faces = []
+        for index, points in enumerate(result.face_landmarks):
+            shapes = result.face_blendshapes[index] if result.face_blendshapes else []
+            shapes = [shape for shape in shapes if shape.category_name != "_neutral"]
+            self.score_names = tuple(shape.category_name for shape in shapes)
+            scores = np.array([shape.score for shape in shapes], np.float32) if shapes else None
+            faces.append(Face(_points(points), scores))
+        return faces
+
+    def close(self) -> None:
+        with quiet():
+            self._landmarker.close()
+
+
+def _line(error: Exception) -> str:
+    return (str(error).splitlines() or ["no reason given"])[0]
