@@ -125,7 +125,7 @@ def observe(
     if chunks and not chunks[-1]["more"]:
         source.warnings.extend(w for w in chunks[-1]["warnings"].tolist())
     else:
-        last = chunks[-1]["frame_id"][-_WARMING:].tolist() if chunks else []
+        last = [number for chunk in chunks for number in chunk["frame_id"].tolist()][-_WARMING:]
         frames = source.frames(every, last[0] if last else 0)
         recent = deque(islice(frames, len(last)), _WARMING)
         while not chunks or chunks[-1]["more"]:
