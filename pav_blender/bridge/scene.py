@@ -81,10 +81,12 @@ def import_track(mesh: Any, collection: Any, clip_name: str, fps: float | None =
     the camera, now the scene's.
 
     The scene's frame numbers are the clip's own (`frame_id`); frames of held-out cameras are left
-    out; between frames everything is linear. Sets the scene's range, size and, if given, rate.
+    out; between frames everything is linear. Sets the scene's range, size and, if given, rate. The
+    clip's pictures stand behind the head in the camera's view, as its background images.
     """
     import bpy
 
+    from . import backdrop
     from .motion import Motion, apply_camera, apply_motion
     from .rig import find_armature
 
@@ -116,6 +118,10 @@ def import_track(mesh: Any, collection: Any, clip_name: str, fps: float | None =
     scene.frame_start, scene.frame_end = int(frames[0]), int(frames[-1])
     if fps is not None:
         render.fps, render.fps_base = _rate(fps)
+    first = collection.image_path(clip, int(rows[0]))
+    backdrop.show_pictures(camera, first.parent, clip.frame_id[rows])
+    for image in backdrop.pictures_of(camera):
+        image.filepath = stored_path(first, bpy.data.filepath)
     scene.frame_set(scene.frame_start)
     return camera
 
@@ -203,6 +209,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """`pav scene`: builds the scene in an empty file and saves it, whole or not at all."""
     from ..core.rendering.sequence import parse_track
+    from . import backdrop
 
     if args.out.suffix != ".blend":
         raise InputError(f"--out {args.out}: a Blender file ends in .blend")
@@ -216,6 +223,9 @@ def run(args: argparse.Namespace) -> int:
             args.avatar, collection, clip.name, appearance=args.appearance, fps=args.fps
         )
         made.mesh.pav.avatar = stored_path(args.avatar, str(args.out))
+        first = collection.image_path(clip, int(_rows(clip)[0]))
+        for image in backdrop.pictures_of(made.camera):
+            image.filepath = stored_path(first, str(args.out))
         _scene().render.filepath = f"//{args.out.stem}/"
         save_copy(args.out)
     print(f"{args.out}: clip {clip.name}, {len(clip)} frames")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -61,6 +62,9 @@ def test_verb_writes_a_blend_that_opens_with_everything_set(registered, files):
     assert scene.render.film_transparent
     (head,) = [object_ for object_ in scene.objects if object_.pav.avatar]
     assert (head.pav.avatar, head.pav.appearance) == ("//../small.pav", "evening")
+    (background,) = scene.camera.data.background_images
+    assert background.image.filepath == "//../collection/clips/walk/images/000003.png"
+    assert Path(bpy.path.abspath(background.image.filepath)).is_file()
 
     collection = read_collection(files / "collection")
     clip = collection.clip("walk")
@@ -111,6 +115,55 @@ def test_operators_add_a_head_and_import_a_track(scene, files):
     assert head.data.shape_keys.animation_data.action is not None
     bpy.ops.pav.import_track()  # again: replaces, adds no second camera
     assert len([object_ for object_ in scene.objects if object_.type == "CAMERA"]) == 1
+    assert len(scene.camera.data.background_images) == 1
+
+
+def _shown(scene, background, frame):
+    """The red of what Blender shows of an image sequence at a frame, as the world's light."""
+    world = scene.world = bpy.data.worlds.new("Shown")
+    world.use_nodes = True
+    tree = world.node_tree
+    node = tree.nodes.new("ShaderNodeTexEnvironment")
+    node.image = background.image
+    for name in ("frame_start", "frame_offset", "frame_duration"):
+        setattr(node.image_user, name, getattr(background.image_user, name))
+    node.image_user.use_auto_refresh = True
+    tree.links.new(node.outputs["Color"], tree.nodes["Background"].inputs["Color"])
+    render = scene.render
+    kept = render.engine, render.film_transparent, render.filepath
+    render.engine, render.film_transparent = "CYCLES", False
+    scene.cycles.samples = 1
+    with tempfile.TemporaryDirectory() as folder:
+        render.filepath = str(Path(folder) / "shown.png")
+        scene.frame_set(frame)
+        bpy.ops.render.render(write_still=True)
+        red = images.read_rgba(render.filepath)[0, 0, 0]
+    render.engine, render.film_transparent, render.filepath = kept
+    bpy.data.worlds.remove(world)
+    return int(red)
+
+
+def test_the_clips_pictures_stand_behind_the_head(scene, files):
+    path = files / "pictures"
+    small.write_collection(path)
+    collection = read_collection(path)
+    clip = collection.clip("walk")
+    for row, frame in enumerate(clip.frame_id):  # told apart by their red
+        picture = np.full((clip.height, clip.width, 4), 255, np.uint8)
+        picture[..., 0] = 40 * frame
+        images.write_rgba(collection.image_path(clip, row), picture)
+    made = bridge_scene.build_scene(files / "small.pav", collection, "walk")
+    camera = made.camera.data
+    (background,) = camera.background_images
+    assert camera.show_background_images
+    assert background.image.source == "SEQUENCE"
+    assert [round(_shown(scene, background, frame) / 40) for frame in (3, 6)] == [3, 6]
+    mine = camera.background_images.new()
+    before = len(bpy.data.images)
+    bridge_scene.import_track(made.mesh, collection, "walk")
+    assert len(camera.background_images) == 2  # the user's stays, ours is replaced
+    assert mine.image is None
+    assert len(bpy.data.images) == before
 
 
 def test_the_clip_menu_lists_the_collection(scene, files):
