@@ -18,16 +18,21 @@ def show_pictures(camera: Any, folder: Path, frames: np.ndarray) -> None:
     """
     import bpy
 
-    remove_pictures(camera)
+    ours = [background for background in camera.data.background_images if _is_ours(background)]
     first, last = int(frames[0]), int(frames[-1])
     path = folder / f"{first:06d}.png"
     if not path.is_file():
+        for background in ours:
+            camera.data.background_images.remove(background)
         return
-    image = bpy.data.images.load(str(path.resolve()))
-    image.name, image[_MARK] = f"{folder.parent.name} pictures", True
+    background = ours[0] if ours else camera.data.background_images.new()
+    # a background that is taken away leaves its image behind, so the image is used again
+    if background.image is None:
+        background.image = bpy.data.images.load(str(path.resolve()))
+        background.image[_MARK] = True
+    image = background.image
+    image.name, image.filepath = f"{folder.parent.name} pictures", str(path.resolve())
     image.source = "SEQUENCE"
-    background = camera.data.background_images.new()
-    background.image = image
     # Blender shows file number: scene frame - frame_start + 1 + frame_offset
     user = background.image_user
     user.frame_start, user.frame_offset = first, first - 1
@@ -38,19 +43,10 @@ def show_pictures(camera: Any, folder: Path, frames: np.ndarray) -> None:
     camera.data.show_background_images = True
 
 
-def remove_pictures(camera: Any) -> None:
-    """Takes away what `show_pictures` has put there."""
-    import bpy
-
-    for background in list(camera.data.background_images):
-        image = background.image
-        if image is not None and image.get(_MARK):
-            camera.data.background_images.remove(background)
-            if image.users == 0:
-                bpy.data.images.remove(image)
-
-
 def pictures_of(camera: Any) -> list[Any]:
-    """The images that `show_pictures` has put before the camera object."""
-    images = [background.image for background in camera.data.background_images]
-    return [image for image in images if image is not None and image.get(_MARK)]
+    """The images that `show_pictures` has put behind what the camera object sees."""
+    return [b.image for b in camera.data.background_images if _is_ours(b)]
+
+
+def _is_ours(background: Any) -> bool:
+    return background.image is not None and bool(background.image.get(_MARK))
