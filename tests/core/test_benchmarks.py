@@ -127,3 +127,29 @@ def test_memory_is_that_of_the_process(tmp_path):
     assert 0.3 <= found < 0.6
     with pytest.raises(PavError, match="broken: ZeroDivisionError"):
         memory._measured("broken", "1 / 0")
+
+
+def test_mattes_are_measured_against_the_truth(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("mediapipe", reason="the optional mediapipe is not installed")
+    from pav_blender.benchmarks import matte
+
+    monkeypatch.setattr(matte, "_FRAMES", 1)
+    fields, claims = matte.run(Options(tmp_path), None)
+    of = {row["matte"]: row for row in fields["mattes"]}
+    assert 0 < of[matte.OURS]["alpha"] < of["pose"]["alpha"]
+    assert [claim.met for claim in claims[:2]] == [True, True]
+    assert "guided filter" in capsys.readouterr().out
+    assert (tmp_path / "matte.svg").is_file()
+
+    truth = np.zeros((64, 64, 4), np.float32)
+    truth[16:48, 16:48] = [0.8, 0.5, 0.3, 1]
+    assert matte._errors(truth, truth) == {"alpha": 0, "halo": 0}
+    # an edge of the background's colour is a halo, an alpha that is too small is both
+    wide = truth.copy()
+    wide[14:50, 14:50, 3] = 1
+    both = matte._errors(wide, truth)
+    assert both["alpha"] > 0.1
+    stained = truth.copy()
+    stained[16:18, 16:48, :3] = 1
+    assert matte._errors(stained, truth)["alpha"] == 0
+    assert matte._errors(stained, truth)["halo"] > 0.005

@@ -2,8 +2,9 @@
 
 The segmentation network's own soft edge is kept: on real clips a guided filter smeared it, and
 placing pixels between the person's and the background's local colours cut dark hair off dark
-backgrounds. What is added is steadiness over time and clean colours under the edge, so that an
-avatar does not learn the background as a fringe.
+backgrounds. What is added is a second, mirrored look, steadiness over time and clean colours under
+the edge, so that an avatar does not learn the background as a fringe. `pav bench matte` measures
+this against what else MediaPipe's wheel carries.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from ..errors import InputError
 from .detectors import INSTALL, load_mediapipe, quiet
 
 MASK_SIDE = 256
-_FLOOR = 0.2  # the network's edge is softer than hair is, and never quite sure
+_FLOOR = 0.1  # the network's edge is softer than hair is, and never quite sure
 _VOTERS = 24
 _ALIKE = 0.08  # radians between turns of the head at which outlines still compare
 _HAIR = 12  # pixels of a mask that short hair may stand off the scalp
@@ -46,11 +47,19 @@ class Segmenter:
             self._network.process(np.zeros((64, 64, 3), np.uint8))
 
     def __call__(self, rgb: np.ndarray) -> np.ndarray:
-        """float32 [S,S,3] in [0,1] -> uint8 [256,256], 255 = person."""
-        with quiet():
-            mask = self._network.process((rgb * 255 + 0.5).astype(np.uint8)).segmentation_mask
-        small = _resized(torch.from_numpy(np.array(mask))[None, None], MASK_SIDE)
+        """float32 [S,S,3] in [0,1] -> uint8 [256,256], 255 = person.
+
+        The mean of the picture's mask and its mirror image's: their mistakes differ.
+        """
+        pixels = (rgb * 255 + 0.5).astype(np.uint8)
+        mirrored = np.ascontiguousarray(pixels[:, ::-1])
+        mask = 0.5 * (self._mask(pixels) + self._mask(mirrored)[:, ::-1])
+        small = _resized(torch.from_numpy(mask)[None, None], MASK_SIDE)
         return (small[0, 0].clip(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
+
+    def _mask(self, pixels: np.ndarray) -> np.ndarray:
+        with quiet():
+            return np.array(self._network.process(pixels).segmentation_mask, np.float32)
 
     def close(self) -> None:
         with quiet():
@@ -59,7 +68,7 @@ class Segmenter:
 
 def segmenter_name() -> str:
     """Tells this segmenter's masks apart from others'."""
-    return f"selfie general, mediapipe {getattr(load_mediapipe(), '__version__', 'unknown')}"
+    return f"selfie general twice, mediapipe {getattr(load_mediapipe(), '__version__', 'unknown')}"
 
 
 def steadied(masks: np.ndarray) -> np.ndarray:
