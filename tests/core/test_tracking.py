@@ -334,11 +334,20 @@ def test_the_matte_is_soft_and_its_colours_are_the_persons():
 def test_masks_waver_less_after_steadying():
     random = np.random.default_rng(0)
     masks = (_disc(256, 80) * 200 + random.integers(0, 55, (6, 256, 256))).astype(np.uint8)
-    steady = matte.steadied(masks)
+    still = np.zeros((6, 3, 2))
+    steady = matte.steadied(masks, still, np.ones(5))
     assert (
         np.diff(steady.astype(float), axis=0).std()
         < 0.6 * np.diff(masks.astype(float), axis=0).std()
     )
+    # across a gap, or where the head has moved, a neighbour would leave its ghost
+    ghosts = np.zeros((4, 256, 256), np.uint8)
+    ghosts[2:, :100] = 255
+    assert 0 < matte.steadied(ghosts, still[:4], np.ones(3))[1].max() < 255
+    assert np.array_equal(matte.steadied(ghosts, still[:4], np.array([1, 5, 1])), ghosts)
+    moved = still[:4].copy()
+    moved[2:] = 9
+    assert np.array_equal(matte.steadied(ghosts, moved, np.ones(3)), ghosts)
 
 
 def test_hair_lost_in_one_frame_comes_back_where_the_head_is_then():

@@ -35,6 +35,7 @@ _FACE, _EARS, _NECK, _HAIR, _CLOTH, _BEARD, _EYES, _LIPS = (
     for n in ("face", "ears", "neck", "scalp_hair", "cloth", "facial_hair", "eyes", "lips")
 )
 _OPAQUE = 64  # alpha from which on a pixel shows the person
+_EAR = 0.04  # of the picture: how far an ear may stand off the fitted one
 _LEAST = 30  # pixels from which a colour can be learnt
 _DARKER = 0.4  # of the skin's brightness: a beard, not a shadow
 _SPREAD = 12.0  # of 255: two colours as near as this are one
@@ -57,16 +58,16 @@ def from_mesh(mesh: np.ndarray, rgba: np.ndarray) -> np.ndarray:
     if not mesh.any():
         return np.where(person, _CLOTH, 0).astype(np.uint8)
     # beside the mesh: as the nearest part of it
-    place = ndimage.distance_transform_edt(mesh == 0, return_distances=False, return_indices=True)
+    away, place = ndimage.distance_transform_edt(mesh == 0, return_indices=True)
     nearest = mesh[tuple(place)]
     low = np.isin(nearest, (_NECK, _CLOTH))
     out = np.where(mesh > 0, mesh, np.where(low, _CLOTH, _HAIR))
-    out = _by_colour(out, mesh, rgba, person)
+    out = _by_colour(out, mesh, rgba, person, (nearest == _EARS) & (away <= _EAR * len(mesh)))
     return np.where(person, out, 0).astype(np.uint8)
 
 
 def _by_colour(
-    out: np.ndarray, mesh: np.ndarray, rgba: np.ndarray, person: np.ndarray
+    out: np.ndarray, mesh: np.ndarray, rgba: np.ndarray, person: np.ndarray, by_ears: np.ndarray
 ) -> np.ndarray:
     """Decides again, by colour, what lies below the face: neck, cloth or hair."""
     rgb = rgba[..., :3].astype(np.float32)
@@ -93,10 +94,10 @@ def _by_colour(
     below = person & np.isin(out, (_NECK, _CLOTH)) & ~_bare(mesh)
     _decide(out, below, rgb, known)
     fringe = np.isin(mesh, (_FACE, _EARS)) & (height < brow - (brow - face_rows[0]) // 4)
-    fringe = person & (fringe | (mesh == _EARS))
-    was = out[fringe]
+    fringe = person & (fringe | by_ears)
     _decide(out, fringe, rgb, {key: known[key] for key in (_NECK, _HAIR) if key in known})
-    out[fringe] = np.where(out[fringe] == _HAIR, _HAIR, was)
+    skin_there = np.where(by_ears, _EARS, _FACE)
+    out = np.where(fringe & (out == _NECK), skin_there, out)
     if _NECK in known:
         jaw = person & (mesh == _FACE) & (height > nose)
         out[jaw & (_darker(known[_NECK], rgb) > _DARKER)] = _BEARD

@@ -20,6 +20,7 @@ from .detectors import INSTALL, load_mediapipe, quiet
 
 MASK_SIDE = 256
 _FLOOR = 0.1  # the network's edge is softer than hair is, and never quite sure
+_STILL = 4.0  # mask pixels that a head may move between frames whose masks are averaged
 _VOTERS = 24
 _ALIKE = 0.08  # radians between turns of the head at which outlines still compare
 _HAIR = 12  # pixels of a mask that short hair may stand off the scalp
@@ -71,10 +72,21 @@ def segmenter_name() -> str:
     return f"selfie general twice, mediapipe {getattr(load_mediapipe(), '__version__', 'unknown')}"
 
 
-def steadied(masks: np.ndarray) -> np.ndarray:
-    """uint8 [F,256,256] -> each averaged with its two neighbours (1, 2, 1), uint8."""
-    padded = np.concatenate([masks[:1], masks, masks[-1:]]).astype(np.uint16)
-    return ((padded[:-2] + 2 * padded[1:-1] + padded[2:] + 2) // 4).astype(np.uint8)
+def steadied(masks: np.ndarray, places: np.ndarray, apart: np.ndarray) -> np.ndarray:
+    """uint8 [F,256,256] -> each averaged with its two neighbours (1, 2, 1), uint8.
+
+    places [F,N,2]: points of the head in mask pixels; apart [F-1]: frames between neighbours. One
+    that is not the very next frame, or shows the head elsewhere, would leave a ghost: it counts as
+    like this one.
+    """
+    moved = np.linalg.norm(np.diff(places, axis=0), axis=2).mean(axis=1)
+    near = (moved <= _STILL) & (apart <= max(1, int(apart.min(initial=1))))
+    near = near[:, None, None]
+    wide = masks.astype(np.uint16)
+    before, after = wide.copy(), wide.copy()
+    before[1:] = np.where(near, wide[:-1], wide[1:])
+    after[:-1] = np.where(near, wide[1:], wide[:-1])
+    return ((before + 2 * wide + after + 2) // 4).astype(np.uint8)
 
 
 def agreed(

@@ -100,7 +100,7 @@ def write_pictures(
     masks = None
     if cut_background:
         masks = _masks(track, work, cache, lambda n: _cutting(tell, n, clip), should_stop)
-        masks = _mended(matte.steadied(masks), head, betas, clip, track)
+        masks = _mended(masks, head, betas, clip, track)
     for row, picture in enumerate(windows(track, work, should_stop)):
         if masks is None:
             rgba = np.concatenate([picture, np.ones_like(picture[..., :1])], axis=2)
@@ -157,8 +157,9 @@ def _masks(
 def _mended(
     masks: np.ndarray, head: HeadModel, betas: np.ndarray, clip: Clip, track: Track
 ) -> np.ndarray:
-    """The masks with the hair and the skull that the network lost."""
+    """The masks made steady, with the hair and the skull that the network lost."""
     places = landmarks_in(track, matte.MASK_SIDE)[:, RIGID]
+    masks = matte.steadied(masks, places, np.diff(track.frame_id))
     scalps = _silhouettes(head, betas, clip, ("scalp",))
     skulls = _silhouettes(head, betas, clip, ("face", "scalp"))
     turns = track.fit.pose[:, 1 if len(head.joint_names) > 1 else 0]
