@@ -68,13 +68,13 @@ def landmarks_in(track: Track, side: int) -> np.ndarray:
 
 
 def windows(
-    track: Track, side: int, should_stop: ShouldStop | None, first: int = 0
+    shot: Shot, rows: np.ndarray, side: int, should_stop: ShouldStop | None = None
 ) -> Iterator[np.ndarray]:
-    """The kept frames' windows from row `first` on, float32 [side, side, 3], in order."""
-    shot, numbers = track.shot, track.frame_id
-    row_of = {int(number): row for number, row in zip(numbers, track.rows, strict=True)}
-    start, stop = int(numbers[first]), int(numbers[-1]) + 1
-    for frame in shot.source.frames(shot.every, start, stop):
+    """The windows of a shot's frames `rows` (of `shot.seen`, ascending), read from its source
+    again: float32 [side, side, 3] in [0, 1], in order. Raises Cancelled."""
+    numbers = shot.seen.frame_id[rows]
+    row_of = {int(number): row for number, row in zip(numbers, rows, strict=True)}
+    for frame in shot.source.frames(shot.every, int(numbers[0]), int(numbers[-1]) + 1):
         row = row_of.get(frame.number)
         if row is None:
             continue
@@ -99,9 +99,11 @@ def write_pictures(
     work = min(track.shot.crop.side, clip.width * 3 // 2)
     masks = None
     if cut_background:
-        masks = _masks(track, work, cache, lambda n: _cutting(tell, n, clip), should_stop)
+        masks = masks_of(
+            track.shot, track.rows, work, cache, lambda n: _cutting(tell, n, clip), should_stop
+        )
         masks = _mended(masks, head, betas, clip, track)
-    for row, picture in enumerate(windows(track, work, should_stop)):
+    for row, picture in enumerate(windows(track.shot, track.rows, work, should_stop)):
         if masks is None:
             rgba = np.concatenate([picture, np.ones_like(picture[..., :1])], axis=2)
         else:
@@ -118,35 +120,38 @@ def _cutting(tell: Report, done: int, clip: Clip) -> None:
     tell(0.4 * done / len(clip), step=f"cutting out {clip.name}")
 
 
-def _masks(
-    track: Track,
+def masks_of(
+    shot: Shot,
+    rows: np.ndarray,
     side: int,
     cache: Cache,
     tell: Callable[[int], None],
-    should_stop: ShouldStop | None,
+    should_stop: ShouldStop | None = None,
 ) -> np.ndarray:
-    """The segmenter's masks of the kept frames, uint8 [F, 256, 256]; cached."""
-    shot, count = track.shot, len(track.rows)
-    crop = shot.crop
+    """The segmenter's masks of a shot's frames `rows`, uint8 [F, 256, 256]; cached.
+
+    side: of the windows that it sees; tell(frames done). Raises Cancelled.
+    """
+    crop, numbers = shot.crop, shot.seen.frame_id[rows]
     parts = (matte.segmenter_name(), shot.source.fingerprint(), shot.every, crop.side, side)
-    key = key_of("masks", *parts, crop.corners[track.rows], track.frame_id)
-    masks = np.empty((count, matte.MASK_SIDE, matte.MASK_SIDE), np.uint8)
+    key = key_of("masks", *parts, crop.corners[rows], numbers)
+    masks = np.empty((len(rows), matte.MASK_SIDE, matte.MASK_SIDE), np.uint8)
     done = 0
-    while done < count:
+    while done < len(rows):
         found = cache.load(key, f"masks{done // _CHUNK:05d}", ("masks",))
         if found is None or found["masks"].shape != masks[done : done + _CHUNK].shape:
             break
         masks[done : done + _CHUNK] = found["masks"]
-        done = min(done + _CHUNK, count)
-    if done == count:
+        done = min(done + _CHUNK, len(rows))
+    if done == len(rows):
         return masks
     segmenter = matte.Segmenter()
     try:
-        for picture in windows(track, side, should_stop, done):
+        for picture in windows(shot, rows[done:], side, should_stop):
             masks[done] = segmenter(picture)
             done += 1
             tell(done)
-            if done % _CHUNK == 0 or done == count:
+            if done % _CHUNK == 0 or done == len(rows):
                 first = (done - 1) // _CHUNK * _CHUNK
                 cache.store(key, f"masks{first // _CHUNK:05d}", {"masks": masks[first:done]})
     finally:
