@@ -333,6 +333,28 @@ def test_clips_share_an_appearance_by_name(tmp_path):
     assert not (out / "clips" / "may" / "labels").exists()  # they need the matte
 
 
+def test_of_two_people_the_one_who_comes_back_is_tracked(tmp_path):
+    """The other is nearer, and made up: the same person, wider."""
+    pictures = []
+    for row in range(10):
+        mine = filmed.frame("crop", row, width=280)
+        other = filmed.frame("grey", 40 - row, width=280, seed=3)
+        other = other[:, (np.arange(350) / 1.25).astype(int)]
+        pictures.append(np.ascontiguousarray(np.hstack([other, mine])))
+    two = filmed.film(tmp_path / "two.mp4", pictures)
+    alone = [filmed.frame("long", row, seed=4) for row in range(10)]
+    one = filmed.film(tmp_path / "one.mp4", alone)
+    report = track([two, one], tmp_path / "out", size=64, cut_background=False)
+    assert report.warnings == []
+    clip = read_collection(tmp_path / "out").clip("two")
+    # the window's left edge in the video: the person's half begins at 350
+    left = (
+        630 / 2
+        - clip.intrinsics[:, 0, 2] / clip.intrinsics[:, 0, 0] * (report.clips[0]["focal_pixels"])
+    )
+    assert (left > 330).all()
+
+
 def test_labels_are_mostly_right_where_the_truth_is_known():
     collection = read_collection(filmed.STUDIO)
     hits = np.zeros((len(LABELS), len(LABELS)))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..collection import Clip, CollectionWriter
-from ..errors import Cancelled
+from ..errors import Cancelled, InputError
 from ..head import HeadModel
 from ..progress import Report
 from ..rendering.cameras import Camera
@@ -71,16 +71,21 @@ def windows(
     shot: Shot, rows: np.ndarray, side: int, should_stop: ShouldStop | None = None
 ) -> Iterator[np.ndarray]:
     """The windows of a shot's frames `rows` (of `shot.seen`, ascending), read from its source
-    again: float32 [side, side, 3] in [0, 1], in order. Raises Cancelled."""
+    again: float32 [side, side, 3] in [0, 1], in order. Raises Cancelled, and InputError where the
+    source has changed since."""
     numbers = shot.seen.frame_id[rows]
     row_of = {int(number): row for number, row in zip(numbers, rows, strict=True)}
+    given = 0
     for frame in shot.source.frames(shot.every, int(numbers[0]), int(numbers[-1]) + 1):
         row = row_of.get(frame.number)
         if row is None:
             continue
         if should_stop is not None and should_stop():
             raise Cancelled("tracking stopped; the same command goes on from here")
+        given += 1
         yield cut(frame.rgb, shot.crop.corners[row], shot.crop.side, side)
+    if given < len(rows):
+        raise InputError(f"{shot.source.path}: changed while it was read; track it again")
 
 
 def write_pictures(
