@@ -377,6 +377,7 @@ def test_names_splits_andranges():
     assert splits(5).tolist() == ["train"] * 4 + ["test"]
     assert (splits(100) == "test").sum() == 10
     assert ranges([1, 2, 3, 7, 9, 10]) == "1-3, 7, 9-10"
+    assert ranges([0, 4, 8, 16], 4) == "0-8, 16"
 
 
 # a made-up video whose head is known: the whole road without a network

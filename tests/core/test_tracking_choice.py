@@ -179,7 +179,7 @@ def test_hands_over_the_face_and_beside_it(model):
     seen.hands[14, 1] = middle + fan  # found again: it was there in between
     seen.hands[20:, 0] = middle + np.array([200, 0]) + fan
     bad = sift.covered(seen, np.arange(30))
-    assert np.flatnonzero(bad).tolist() == list(range(7, 16))
+    assert np.flatnonzero(bad).tolist() == list(range(6, 17))
     assert not sift.covered(seen, np.arange(20, 30)).any()
 
 

@@ -71,8 +71,9 @@ def left_out(collection: Collection) -> list[tuple[str, str, str]]:
         return []
     rows = []
     for entry in tracking.get("clips", ()):
+        step = entry.get("every", 1)
         for reason, numbers in _reasons(entry.get("left_out")).items():
-            rows.append((str(entry.get("name")), reason, ranges(numbers)))
+            rows.append((str(entry.get("name")), reason, ranges(numbers, step)))
     for entry in tracking.get("skipped", ()):
         frames = f"{entry.get('first')}-{entry.get('last')}"
         rows.append((str(entry.get("video")), str(entry.get("reason")), frames))

@@ -88,7 +88,7 @@ def run(args: argparse.Namespace, should_stop: ShouldStop | None = None) -> int:
             + (f"; {clip['not_chosen']} more of use" if clip["not_chosen"] else "")
         )
         for reason, numbers in clip["left_out"].items():
-            print(f"  left out, {reason}: {ranges(numbers)}")
+            print(f"  left out, {reason}: {ranges(numbers, args.every)}")
     for shot in report.skipped:
         print(f"{shot['video']}: frames {shot['first']}-{shot['last']} left out, {shot['reason']}")
     print(f"wrote {report.path}")

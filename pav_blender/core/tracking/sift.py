@@ -17,9 +17,10 @@ JUMPING = "landmarks jump"
 NO_FIT = "head does not fit"
 SHORT_SHOT = "shot too short"
 
-# points of a hand (of 21) inside the face's outline; frames between two covered ones; a frame that
-# a hand is about to reach, or has just left, counts as covered
-_POINTS, _BETWEEN, _BESIDE = 2, 6, 1
+# points of a hand (of 21) inside the face's outline, which is widened by so much, for a hand at the
+# chin spoils the picture too; frames between two covered ones; and so many that a hand is about to
+# reach, or has just left
+_POINTS, _WIDER, _BETWEEN, _BESIDE = 2, 1.2, 6, 2
 # of what is usual in the clip
 _DULL = 0.25
 _ABOUT, _STRAY, _STRAY_LEAST = 4, 5.0, 0.05
@@ -52,9 +53,12 @@ def _add(left_out: dict[str, list[int]], reason: str, numbers: np.ndarray) -> No
 def covered(seen: Sightings, faces: np.ndarray) -> np.ndarray:
     """bool [n]: a hand is in front of the face."""
     row = seen.row[faces]
+    outlines = seen.landmarks[faces][:, OVAL, :2]
+    middles = outlines.mean(axis=1, keepdims=True)
+    outlines = middles + _WIDER * (outlines - middles)
     inside = [
-        np.count_nonzero(_within(seen.hands[r].reshape(-1, 2), seen.landmarks[k, OVAL, :2]))
-        for r, k in zip(row, faces, strict=True)
+        np.count_nonzero(_within(seen.hands[r].reshape(-1, 2), outline))
+        for r, outline in zip(row, outlines, strict=True)
     ]
     hit = row[np.array(inside, int) >= _POINTS]
     reach = np.zeros(len(seen.frame_id) + 2 * _BESIDE, bool)
@@ -96,11 +100,11 @@ def jumping(seen: Sightings, faces: np.ndarray) -> np.ndarray:
     return away > max(_STRAY_LEAST, _STRAY * float(np.median(away)))
 
 
-def ranges(numbers: list[int]) -> str:
-    """[1, 2, 3, 7] -> '1-3, 7'."""
+def ranges(numbers: list[int], step: int = 1) -> str:
+    """[1, 2, 3, 7] -> '1-3, 7'; step: between frames that were looked at."""
     parts: list[list[int]] = []
     for number in sorted(numbers):
-        if parts and number == parts[-1][1] + 1:
+        if parts and number == parts[-1][1] + step:
             parts[-1][1] = number
         else:
             parts.append([number, number])

@@ -29,7 +29,7 @@ _WORST_OF_MEDIAN, _WORST_OF_EYES = 3.0, 0.08
 
 @dataclass(eq=False)
 class TrackReport:
-    """What `track` did. clips: one dict each (name, video, rate, frames, left_out: numbers of
+    """What `track` did. clips: one dict each (name, video, rate, every, frames, left_out: numbers of
     frames by reason, not_chosen: how many more could have been used, error_percent: the median
     landmark distance in percent of the distance between the pupils, focal_pixels, picture_moves);
     skipped: one dict a shot that became no clip (video, first, last, reason, left_out); warnings:
@@ -204,6 +204,7 @@ def _finish(shot: Shot, fit: ClipFit, errors: np.ndarray, eye_distance: float) -
         "name": shot.name,
         "video": shot.source.path.name,
         "rate": shot.source.rate,
+        "every": shot.every,
         "frames": len(rows),
         "left_out": left_out,
         "not_chosen": shot.not_chosen,
