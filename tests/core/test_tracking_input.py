@@ -172,19 +172,28 @@ def test_stopped_anywhere_and_going_on_gives_the_same(scene, tmp_path, monkeypat
     assert not out.with_name("out.partial").exists()
 
 
-def test_killed_at_any_moment_nothing_stands_under_the_final_name(scene, tmp_path):
+@pytest.mark.parametrize(
+    "how", [signal.SIGINT, pytest.param(signal.SIGKILL, marks=pytest.mark.slow)]
+)
+def test_stopped_from_outside_nothing_stands_under_the_final_name(scene, tmp_path, how):
     video, out, _ = scene
     command = [sys.executable, "-m", "pav_blender", "track", str(video), "--size", "96"]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     process = subprocess.Popen(
-        [*command, "--out", str(tmp_path / "out")], env=environment, stderr=subprocess.DEVNULL
+        [*command, "--out", str(tmp_path / "out")],
+        env=environment,
+        stderr=subprocess.PIPE,
+        text=True,
     )
     marker = tmp_path / "out.partial"
     deadline = time.monotonic() + 60
     while not marker.exists() and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.05)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
+    process.send_signal(how)
+    told = process.communicate(timeout=60)[1]
+    if how == signal.SIGINT:
+        assert process.returncode == 1
+        assert "pav: tracking stopped; the same command goes on from here" in told
     assert marker.exists()
     assert not (tmp_path / "out").exists()
     track([video], tmp_path / "out", size=96)
@@ -284,7 +293,7 @@ def test_pictures_of_any_kind_read_alike(tmp_path):
     [
         (144, 256, 15, "plain"),
         (640, 360, 60, "plain"),
-        (2160, 3840, 30, "plain"),
+        pytest.param(2160, 3840, 30, "plain", marks=pytest.mark.slow),
         (240, 320, 24, "grey"),
         (240, 320, 24, "dark"),
     ],

@@ -6,6 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from ..errors import Cancelled
 from ..progress import Progress
 from .sift import ranges
 from .track import track
@@ -64,21 +65,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace, should_stop: ShouldStop | None = None) -> int:
     """Runs the verb and prints one line a clip. Raises what `track` raises; returns 0."""
-    report = track(
-        args.videos,
-        args.out,
-        size=args.size,
-        max_frames=args.max_frames,
-        every=args.every,
-        appearances=args.appearance,
-        head=args.head,
-        model=args.landmark_model,
-        cut_background=args.matte == "segment",
-        cuts=args.cuts == "split",
-        overwrite=args.overwrite,
-        progress=Progress("track", as_json=getattr(args, "json_progress", False)),
-        should_stop=should_stop,
-    )
+    try:
+        report = track(
+            args.videos,
+            args.out,
+            size=args.size,
+            max_frames=args.max_frames,
+            every=args.every,
+            appearances=args.appearance,
+            head=args.head,
+            model=args.landmark_model,
+            cut_background=args.matte == "segment",
+            cuts=args.cuts == "split",
+            overwrite=args.overwrite,
+            progress=Progress("track", as_json=getattr(args, "json_progress", False)),
+            should_stop=should_stop,
+        )
+    except KeyboardInterrupt as stop:
+        raise Cancelled("tracking stopped; the same command goes on from here") from stop
     for line in report.warnings:
         print(f"warning: {line}", file=sys.stderr)
     for clip in report.clips:

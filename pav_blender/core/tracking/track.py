@@ -29,11 +29,13 @@ _WORST_OF_MEDIAN, _WORST_OF_EYES = 3.0, 0.08
 
 @dataclass(eq=False)
 class TrackReport:
-    """What `track` did. clips: one dict each (name, video, rate, every, frames, left_out: numbers of
-    frames by reason, not_chosen: how many more could have been used, error_percent: the median
-    landmark distance in percent of the distance between the pupils, focal_pixels, picture_moves);
-    skipped: one dict a shot that became no clip (video, first, last, reason, left_out); warnings:
-    one line each."""
+    """What `track` did.
+
+    clips: one dict each (name, video, rate, every, frames, left_out: numbers of frames by reason,
+    not_chosen: how many more could have been used, error_percent: the median landmark distance in
+    percent of the distance between the pupils, focal_pixels, picture_moves); skipped: one dict a
+    shot that became no clip (video, first, last, reason, left_out); warnings: one line each.
+    """
 
     path: Path
     clips: list[dict]
