@@ -9,7 +9,7 @@ from pav_blender.core.errors import InputError
 from pav_blender.core.head import builtin_head
 from pav_blender.core.tracking import sift
 from pav_blender.core.tracking.landmark_model import LandmarkModel
-from pav_blender.core.tracking.looking import SHORTEST, choose_shots
+from pav_blender.core.tracking.looking import SHORTEST, Take, choose_shots
 from pav_blender.core.tracking.observe import Sightings, sharpness
 from pav_blender.core.tracking.people import apart, choose, follow, shape_of
 from pav_blender.core.tracking.pictures import natural
@@ -71,9 +71,11 @@ class Named:
 
 
 def chosen(tmp_path, *seen, most=None, cuts=True):
-    sources = [Named(tmp_path / f"{'abc'[i]}.mp4") for i in range(len(seen))]
-    names = list("abc"[: len(seen)])
-    return choose_shots(sources, seen, names, names, every=1, most=most, cuts=cuts)
+    takes = [
+        Take(Named(tmp_path / f"{name}.mp4"), one, 1, name, name)
+        for name, one in zip("abc", seen, strict=False)
+    ]
+    return choose_shots(takes, most, cuts=cuts)
 
 
 def rooms(*lengths):
@@ -97,6 +99,9 @@ def test_each_shot_becomes_a_clip_and_short_ones_are_listed(model, tmp_path):
     assert looked.shots[1].seen.frame_id.tolist() == list(range(24, 44))
     (skipped,) = looked.skipped
     assert (skipped["first"], skipped["last"], skipped["reason"]) == (20, 23, sift.SHORT_SHOT)
+    named = [Take(Named(tmp_path / name), seen, 1, name, name) for name in ("a_2", "a")]
+    names = [shot.name for shot in choose_shots(named, None).shots]
+    assert names == ["a_2_1", "a_2_2", "a_1", "a_3"]
     whole = chosen(tmp_path, seen, cuts=False)
     assert [(shot.name, len(shot.seen)) for shot in whole.shots] == [("a", 44)]
 

@@ -137,9 +137,10 @@ def test_the_same_input_gives_the_same_files(scene, tmp_path):
     assert digests(tmp_path / "again") == digests(out)
 
 
-def test_stopped_anywhere_and_going_on_gives_the_same(scene, tmp_path, monkeypatch):
-    video, _, _ = scene
-    monkeypatch.setattr(observing, "CHUNK", 6)
+def test_stopped_anywhere_and_going_on_gives_the_same(tmp_path_factory, tmp_path, monkeypatch):
+    pictures = [filmed.frame("crop", row) for row in range(10)]
+    video = filmed.film(tmp_path_factory.mktemp("video") / "ten.mp4", pictures)
+    monkeypatch.setattr(observing, "CHUNK", 4)
     track([video], tmp_path / "whole", size=96)
     asked, looked = [0], []
     original = observing._chunk
@@ -160,7 +161,7 @@ def test_stopped_anywhere_and_going_on_gives_the_same(scene, tmp_path, monkeypat
         return should_stop
 
     out = tmp_path / "out"
-    for count in (17, 60):
+    for count in (7, 22):
         with pytest.raises(Cancelled, match="tracking stopped"):
             track([video], out, size=96, should_stop=stop_after(count))
         assert not out.exists()

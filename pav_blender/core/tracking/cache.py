@@ -10,6 +10,7 @@ import hashlib
 import shutil
 import zipfile
 from collections.abc import Iterable
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -83,9 +84,15 @@ def fingerprint(files: Iterable[Path]) -> str:
     for path in files:
         digest.update(path.name.encode("utf-8", "surrogateescape") + b"\0")
         try:
-            with open(path, "rb") as stream:
-                while block := stream.read(1 << 20):
-                    digest.update(block)
+            state = path.stat()
+            digest.update(_contents(path, state.st_size, state.st_mtime_ns))
         except OSError as error:
             raise InputError(f"{path}: cannot be read: {error.strerror}") from error
     return digest.hexdigest()
+
+
+@lru_cache(maxsize=4096)
+def _contents(path: Path, _size: int, _changed: int) -> bytes:
+    """A file's contents as one number, read once while the file stays as it is."""
+    with open(path, "rb") as stream:
+        return hashlib.file_digest(stream, lambda: hashlib.blake2b(digest_size=16)).digest()

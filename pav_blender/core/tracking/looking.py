@@ -40,6 +40,17 @@ class Shot:
     not_chosen: int
 
 
+@dataclass(frozen=True, eq=False)
+class Take:
+    """A source, what is seen in every `every`-th of its frames, and what its clips are called."""
+
+    source: Source
+    seen: Sightings
+    every: int
+    name: str
+    appearance: str
+
+
 @dataclass(eq=False)
 class Looked:
     """shots: those that are used; skipped: a dict for each that is not (video, first, last,
@@ -70,41 +81,30 @@ def sight(
     )
 
 
-def choose_shots(
-    sources: Sequence[Source],
-    sightings: Sequence[Sightings],
-    names: Sequence[str],
-    appearances: Sequence[str],
-    *,
-    every: int,
-    most: int | None,
-    cuts: bool = True,
-) -> Looked:
+def choose_shots(takes: Sequence[Take], most: int | None, *, cuts: bool = True) -> Looked:
     """The shots of all sources that show the person, each with the frames that are used.
 
     most: frames a shot. Raises InputError where a source has nothing of use.
     """
     looked = Looked()
-    runs = [_runs(seen, cuts) for seen in sightings]
+    runs = [_runs(take.seen, cuts) for take in takes]
     faces = [
         face
-        for number, seen in enumerate(sightings)
+        for number, take in enumerate(takes)
         for shot, rows in enumerate(runs[number])
-        for face in people.follow(seen, number, shot, rows)
+        for face in people.follow(take.seen, number, shot, rows)
     ]
     person, absent = people.choose(faces)
     for number in absent:
         looked.warnings.append(
-            f"{sources[number].path}: no face in it resembles that of the other clips; its largest "
-            "is used, see `pav check`"
+            f"{takes[number].source.path}: no face in it resembles that of the other clips; its "
+            "largest is used, see `pav check`"
         )
         person += people.choose([face for face in faces if face.source == number])[0]
-    for number, (source, seen) in enumerate(zip(sources, sightings, strict=True)):
+    for number, take in enumerate(takes):
         mine = [face for face in person if face.source == number]
-        _add_source(looked, source, seen, runs[number], mine, names[number], most)
-        for shot in looked.shots:
-            if shot.source is source:
-                shot.appearance, shot.every = appearances[number], every
+        others = {other.name for other in takes} | {shot.name for shot in looked.shots}
+        _add_shots(looked, take, runs[number], mine, others, most)
     return looked
 
 
@@ -113,15 +113,15 @@ def _runs(seen: Sightings, cuts: bool) -> list[np.ndarray]:
     return cut_into_shots(seen) if cuts else whole
 
 
-def _add_source(
+def _add_shots(
     looked: Looked,
-    source: Source,
-    seen: Sightings,
+    take: Take,
     runs: list[np.ndarray],
     person: list[people.Face],
-    name: str,
+    taken: set[str],
     most: int | None,
 ) -> None:
+    source, seen = take.source, take.seen
     usable = [_usable(seen, rows, person, shot) for shot, rows in enumerate(runs)]
     long_enough = [len(faces) >= SHORTEST or len(runs) == 1 for faces, _ in usable]
     if not any(long_enough) and len(runs) > 1:
@@ -150,9 +150,11 @@ def _add_source(
                 f"{source.path}: none of its frames can be used "
                 f"({', '.join(f'{len(v)} {k}' for k, v in left_out.items())})"
             )
-        made += 1
-        title = name if count == 1 else f"{name}_{made}"
-        looked.shots.append(_shot(source, seen, faces, left_out, title, most))
+        name = take.name
+        while count > 1 and name in taken:  # another source may be called NAME_2
+            made += 1
+            name = f"{take.name}_{made}"
+        looked.shots.append(_shot(take, faces, left_out, name, most))
 
 
 def _usable(
@@ -180,15 +182,13 @@ def _main_reason(left_out: dict[str, list[int]], frames: int) -> str:
 
 
 def _shot(
-    source: Source,
-    seen: Sightings,
-    faces: np.ndarray,
-    left_out: dict[str, list[int]],
-    name: str,
-    most: int | None,
+    take: Take, faces: np.ndarray, left_out: dict[str, list[int]], name: str, most: int | None
 ) -> Shot:
+    seen = take.seen
     usable = seen.observations(faces)
     used = usable.subset(spread(usable, most))
     some = slice(None, None, max(1, len(seen.tall) // _BORDER_SAMPLES))
-    crop = plan_crop(used, content_box(seen.tall[some], seen.wide[some]), str(source.path))
-    return Shot(source, name, name, 1, used, crop, left_out, len(usable) - len(used))
+    box = content_box(seen.tall[some], seen.wide[some])
+    crop = plan_crop(used, box, str(take.source.path))
+    more = len(usable) - len(used)
+    return Shot(take.source, name, take.appearance, take.every, used, crop, left_out, more)

@@ -16,7 +16,7 @@ from ..progress import Report
 from . import detectors
 from .cache import Cache
 from .fit import ClipFit, fit_head
-from .looking import Shot, choose_shots, sight
+from .looking import Shot, Take, choose_shots, sight
 from .pictures import open_source
 from .sift import NO_FIT
 from .write import ShouldStop, Track, clip_of, write_pictures
@@ -81,18 +81,13 @@ def track(
     looks = appearance_names(names, appearances)
     cache = Cache(out.with_name(f"{out.name}.partial"))
     share = _OBSERVING / len(sources)
-    sightings = [
-        sight(
-            source,
-            every,
-            model,
-            cache,
-            _counted(_part(tell, share * index, share), source.count // every, names[index]),
-            should_stop,
-        )
-        for index, source in enumerate(sources)
-    ]
-    looked = choose_shots(sources, sightings, names, looks, every=every, most=max_frames, cuts=cuts)
+    takes = []
+    for index, source in enumerate(sources):
+        part = _part(tell, share * index, share)
+        tell_frames = _counted(part, source.count // every, names[index])
+        seen = sight(source, every, model, cache, tell_frames, should_stop)
+        takes.append(Take(source, seen, every, names[index], looks[index]))
+    looked = choose_shots(takes, max_frames, cuts=cuts)
     fit = fit_head(
         head_model,
         [shot.seen for shot in looked.shots],
