@@ -134,3 +134,25 @@ def test_the_overlay_shows_every_clip(toy, tmp_path):
     assert sheet.shape[1] > 6 * 64
     green = (sheet[..., 1].astype(int) - sheet[..., 0] > 40).mean()
     assert green > 0.02
+
+
+def test_what_a_tracker_left_out_is_read_with_care(toy):
+    from dataclasses import replace
+
+    from pav_blender.core.evaluation.review import left_out
+
+    def told(tracking):
+        return left_out(replace(toy, extra={"tracking": tracking}))
+
+    clips = [{"name": "a", "left_out": {"blurred": [1, 2, 5]}}, {"name": "b", "left_out": [7]}]
+    skipped = [{"video": "a.mp4", "first": 8, "last": 9, "reason": "shot too short"}]
+    assert told({"clips": clips, "skipped": skipped}) == [
+        ("a", "blurred", "1-2, 5"),
+        ("b", "not usable", "7"),
+        ("a.mp4", "shot too short", "8-9"),
+    ]
+    every = [{"name": "a", "every": 2, "left_out": {"blurred": [2, 4]}}]
+    assert told({"clips": every}) == [("a", "blurred", "2-4")]
+    for broken in (None, 3, [], {"clips": 5}, {"clips": [1], "skipped": "x"}):
+        assert told(broken) == []
+    assert told({"clips": [{"name": "a", "left_out": {"x": 1, "y": []}}]}) == []

@@ -66,25 +66,35 @@ def _tracked(collection: Collection, clip: Clip, row: int) -> np.ndarray:
 
 def left_out(collection: Collection) -> list[tuple[str, str, str]]:
     """(clip or video, reason, frames) of everything the tracker left out; empty if not tracked."""
-    tracking = collection.extra.get("tracking")
-    if not isinstance(tracking, dict):
-        return []
     rows = []
-    for entry in tracking.get("clips", ()):
-        step = entry.get("every", 1)
+    for entry in _tracking(collection, "clips"):
+        step = entry.get("every")
         for reason, numbers in _reasons(entry.get("left_out")).items():
-            rows.append((str(entry.get("name")), reason, ranges(numbers, step)))
-    for entry in tracking.get("skipped", ()):
+            frames = ranges(numbers, step if isinstance(step, int) else 1)
+            rows.append((str(entry.get("name")), reason, frames))
+    for entry in _tracking(collection, "skipped"):
         frames = f"{entry.get('first')}-{entry.get('last')}"
         rows.append((str(entry.get("video")), str(entry.get("reason")), frames))
     return rows
 
 
+def _tracking(collection: Collection, part: str) -> list[dict]:
+    """What `pav track` wrote about clips or skipped shots; nothing where that is malformed."""
+    tracking = collection.extra.get("tracking")
+    entries = tracking.get(part) if isinstance(tracking, dict) else None
+    return [
+        entry for entry in (entries if isinstance(entries, list) else ()) if isinstance(entry, dict)
+    ]
+
+
 def _reasons(stored: Any) -> dict[str, list[int]]:
     """Also of collections that hold the numbers alone."""
-    if isinstance(stored, dict):
-        return {str(key): [int(n) for n in value] for key, value in stored.items()}
-    return {"not usable": [int(n) for n in stored]} if stored else {}
+    reasons = stored if isinstance(stored, dict) else {"not usable": stored}
+    return {
+        str(reason): [number for number in numbers if isinstance(number, int)]
+        for reason, numbers in reasons.items()
+        if isinstance(numbers, list) and numbers
+    }
 
 
 def overlay(collection: Collection, clip: Clip, row: int) -> np.ndarray:
@@ -220,8 +230,6 @@ def _fill(
 
 def _rate(collection: Collection) -> Fraction:
     """Frames a second of the first tracked video; 25 where it is not known."""
-    tracking = collection.extra.get("tracking")
-    clips = tracking.get("clips", ()) if isinstance(tracking, dict) else ()
-    rates = [entry.get("rate") for entry in clips]
+    rates = [entry.get("rate") for entry in _tracking(collection, "clips")]
     known = [rate for rate in rates if isinstance(rate, int | float) and 1 <= rate <= 240]
     return Fraction(known[0] if known else 25).limit_denominator(1001)
