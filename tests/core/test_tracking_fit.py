@@ -1,6 +1,7 @@
 """The head fit on landmarks made from the head itself, where every parameter is known."""
 
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,9 @@ from pav_blender.core.rendering.cameras import Camera
 from pav_blender.core.tracking import bordered
 from pav_blender.core.tracking.fit import fit_head, world
 from pav_blender.core.tracking.landmark_model import (
+    OFFSETS_PATH,
     LandmarkModel,
+    PointModel,
     axis_angles,
     rotation_derivatives,
     rotations,
@@ -190,8 +193,6 @@ def test_stop_is_heeded(head):
 
 
 def test_a_head_without_landmarks_is_refused(head):
-    from dataclasses import replace
-
     bare = replace(
         head, landmark_triangles=np.zeros(0, np.int32), landmark_barycentrics=np.zeros((0, 3))
     )
@@ -200,14 +201,12 @@ def test_a_head_without_landmarks_is_refused(head):
 
 
 @pytest.mark.parametrize("correctives", [False, True])
-def test_landmark_model_is_the_heads_and_its_derivatives_are_exact(head, correctives):
-    from dataclasses import replace
-
+def test_point_model_is_the_heads_and_its_derivatives_are_exact(head, correctives):
     random = np.random.default_rng(0)
     if correctives:  # as FLAME has them
         basis = random.normal(0, 1e-3, (36, *head.template.shape)).astype(np.float32)
         head = replace(head, pose_basis=basis)
-    model = LandmarkModel(head, 6)
+    model = PointModel(head, 6, head.landmark_triangles, head.landmark_barycentrics)
     frames = 2
     betas, expression = random.normal(size=6), random.uniform(0, 1, (frames, model.expressions))
     pose, translation = random.normal(0, 0.3, (frames, 5, 3)), random.normal(size=(frames, 3))
@@ -288,3 +287,25 @@ def test_bordered_solution_is_the_dense_one(frames):
     expected = -np.linalg.solve(dense, right)
     steps, last = bordered.solve(normals, 0.1)
     assert np.allclose(np.concatenate([*map(np.ravel, steps), last]), expected)
+
+
+def test_landmarks_stand_where_the_detector_sees_them(head):
+    """Off the built-in head's surface by what was measured, and turning with the head."""
+    offsets = np.load(OFFSETS_PATH, allow_pickle=False)
+    assert offsets.shape == (478, 3)
+    assert 1e-4 < np.linalg.norm(offsets, axis=1).mean() < 6e-3
+    plain = PointModel(head, 4, head.landmark_triangles, head.landmark_barycentrics)
+    pose = np.zeros((1, len(head.joint_names), 3))
+    pose[:, 1, 1] = 0.5
+    nothing = np.zeros(4), np.zeros((1, len(head.expression_names))), pose, np.zeros((1, 3))
+    moved = LandmarkModel(head, 4).pose(*nothing).points - plain.pose(*nothing).points
+    turned = offsets @ rotations(pose[0, 1]).T
+    still = head.skinning_weights[:, 1:].sum(axis=1) > 0.999
+    skull = still[plain.corners].all(axis=1)
+    skull &= head.skinning_weights[plain.corners, 1].min(axis=1) > 0.999
+    assert skull.sum() > 100
+    assert np.abs(moved[0, skull] - turned[skull]).max() < 1e-6
+    other = replace(head, landmark_triangles=np.roll(head.landmark_triangles, 1))
+    assert np.abs(LandmarkModel(other, 4).rest - PointModel(
+        other, 4, other.landmark_triangles, other.landmark_barycentrics
+    ).rest).max() == 0  # fmt: skip

@@ -9,11 +9,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 
 from ..errors import InputError
-from ..head import HeadModel
+from ..head import HeadModel, builtin_head
+
+# where the detector sees the built-in head's landmarks: [478,3] metres from their places on the
+# surface, in the head's frame; see tools/measure_detector.py
+OFFSETS_PATH = Path(__file__).parent / "data" / "mediapipe_offsets.npy"
 
 # MediaPipe's face mesh, by the numbers its documentation gives
 LIPS = (
@@ -45,21 +50,25 @@ class Posed:
     local: np.ndarray  # [F,J,3,3] joints' own rotations
 
 
-class LandmarkModel:
-    """L landmarks of `head`, with the first `shapes` identity components.
+class PointModel:
+    """L points on `head`, with the first `shapes` identity components.
 
-    Raises InputError where the head has no landmarks.
+    triangles [L], barycentrics [L,3]: where they are; offsets [L,3]: metres that they stand off
+    the neutral surface.
     """
 
-    def __init__(self, head: HeadModel, shapes: int) -> None:
-        if len(head.landmark_triangles) == 0:
-            raise InputError(
-                f"head {head.name!r} has no landmark embedding, which tracking needs; add one "
-                "(docs: head files) or track with the built-in head"
-            )
+    def __init__(
+        self,
+        head: HeadModel,
+        shapes: int,
+        triangles: np.ndarray,
+        barycentrics: np.ndarray,
+        offsets: np.ndarray | None = None,
+    ) -> None:
         self.head = head
-        corners = head.triangles[head.landmark_triangles]  # [L,3]
-        mix = head.landmark_barycentrics.astype(np.float64)
+        self.barycentrics = barycentrics.astype(np.float64)
+        self.corners = corners = head.triangles[triangles]  # [L,3]
+        mix = self.barycentrics
         skin = mix[..., None] * head.skinning_weights[corners]  # [L,3,J]
         self.shapes = min(shapes, len(head.shape_basis))
         self.expressions = len(head.expression_basis)
@@ -74,6 +83,8 @@ class LandmarkModel:
         self.share = np.ascontiguousarray(skin.sum(axis=1).T)  # [J,L]
         rest = head.template[corners].astype(np.float64)
         self.rest = np.einsum("lvj,lvx->jxl", skin, rest)
+        if offsets is not None:
+            self.rest += self.share[:, None] * offsets.astype(np.float64).T
         self.basis = np.einsum("lvj,klvx->kjxl", skin, bases, optimize=True)  # [K,J,3,L]
         regressor = head.joint_regressor.astype(np.float64)
         self.joint_rest = regressor @ head.template
@@ -86,8 +97,7 @@ class LandmarkModel:
 
     @cached_property
     def normals(self) -> np.ndarray:
-        """Outward directions [L,3] of the neutral head at the landmarks; lips, lids and irises,
-        whose own surface turns inward, face forward."""
+        """Outward directions [L,3] of the neutral head at the points."""
         head = self.head
         vertices = head.template.astype(np.float64)
         a, b, c = (vertices[head.triangles[:, i]] for i in range(3))
@@ -95,10 +105,15 @@ class LandmarkModel:
         summed = np.zeros_like(vertices)
         for i in range(3):
             np.add.at(summed, head.triangles[:, i], flat)
-        corners = head.triangles[head.landmark_triangles]
-        normals = (summed[corners] * head.landmark_barycentrics[..., None]).sum(axis=1)
-        normals[[*LIPS, *RIGHT_LIDS, *LEFT_LIDS, *RIGHT_IRIS, *LEFT_IRIS]] = (0, 0, 1)
+        normals = (summed[self.corners] * self.barycentrics[..., None]).sum(axis=1)
         return normals / np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-12)
+
+    def facing(self, posed: Posed) -> np.ndarray:
+        """Cosines [F,L] between the points' directions and the way to the camera at the origin."""
+        turn = posed.turns[:, 1 if self.joints > 1 else 0]
+        normals = np.einsum("fxy,ly->flx", turn, self.normals)
+        view = -posed.points / np.linalg.norm(posed.points, axis=2, keepdims=True)
+        return (normals * view).sum(axis=2)
 
     @cached_property
     def growth(self) -> np.ndarray:
@@ -187,6 +202,42 @@ class LandmarkModel:
         drift = (flat @ self.share).astype(np.float32)
         drift = drift.reshape(len(outer), -1, 1, *outer.shape[2:])  # [F,B,1,3,L]
         return (outer[:, None] * drift).sum(axis=3)
+
+
+class LandmarkModel(PointModel):
+    """A head's landmarks, where the detector would see them.
+
+    Raises InputError where the head has no landmarks.
+    """
+
+    def __init__(self, head: HeadModel, shapes: int) -> None:
+        if len(head.landmark_triangles) == 0:
+            raise InputError(
+                f"head {head.name!r} has no landmark embedding, which tracking needs; add one "
+                "(docs: head files) or track with the built-in head"
+            )
+        super().__init__(
+            head,
+            shapes,
+            head.landmark_triangles,
+            head.landmark_barycentrics,
+            np.load(OFFSETS_PATH, allow_pickle=False) if _is_builtin(head) else None,
+        )
+
+    @cached_property
+    def normals(self) -> np.ndarray:
+        """As a point's; but lips, lids and irises, whose own surface turns inward, face forward."""
+        normals = PointModel.normals.func(self)  # type: ignore[attr-defined]
+        normals[[*LIPS, *RIGHT_LIDS, *LEFT_LIDS, *RIGHT_IRIS, *LEFT_IRIS]] = (0, 0, 1)
+        return normals
+
+
+def _is_builtin(head: HeadModel) -> bool:
+    """The same surface with the same landmarks, whatever the file is called."""
+    builtin = builtin_head()
+    return head.fingerprint == builtin.fingerprint and np.array_equal(
+        head.landmark_triangles, builtin.landmark_triangles
+    )
 
 
 @dataclass(eq=False)

@@ -29,14 +29,14 @@ SCORE_SPREAD = 0.3
 # and the distance one is filmed from; spreads are of logarithms.
 FOCAL_OF_SIDE, FOCAL_OF_SIDE_SPREAD = 1.3, 0.6
 METRES_AWAY, METRES_AWAY_SPREAD = 1.0, 0.3
-FOCAL_SPREAD = 0.1
+FOCAL_SPREAD = 0.3
 ROOT_SPREAD, NECK_SPREAD = 0.12, 0.25
 # A landmark's place on the head is itself uncertain, and no number of frames cures that: so many
 # frames of a clip add up to one independent look at what stays the same (identity, lens).
 FRAMES_A_LOOK = 12
 # One camera cannot see how large a head is; left alone, heads shrink, for then the same components
 # bend them more cheaply. Relative spread of a head's size about its model's.
-SIZE_SPREAD = 0.001
+SIZE_SPREAD = 0.02
 
 
 def focal_guess(side: float, pixels_per_metre: float) -> float:
@@ -51,7 +51,7 @@ class FramePrior:
     """For the n unknowns of a frame (joints but the root, translation, expression).
 
     mean, weight [n] of quadratic terms; steady [n]: weight on second differences over time;
-    low, high [n] with `wall` [n]: the weight on going past them; pairs: (i, j, weight) terms that
+    low, high [n]: limits; pairs: (i, j, weight) terms that
     hold unknowns i and j equal.
     """
 
@@ -60,7 +60,6 @@ class FramePrior:
     steady: np.ndarray
     low: np.ndarray
     high: np.ndarray
-    wall: np.ndarray
     pairs: tuple[tuple[int, int, float], ...]
 
 
@@ -108,15 +107,12 @@ def frame_prior(head: HeadModel) -> FramePrior:
     jitter += [0.3 if shapes else 1.0] * count
     low += [0.0 if shapes else -np.inf] * count
     high += [1.0 if shapes else np.inf] * count
-    size = len(mean)
-    wall = np.full(size, 1 / 0.005**2)
     return FramePrior(
         np.array(mean),
         1 / np.array(spread) ** 2,
         1 / np.array(jitter) ** 2,
         np.array(low),
         np.array(high),
-        wall,
         _eye_pairs(head),
     )
 

@@ -1,0 +1,174 @@
+"""How far a tracked collection is from the truth that a studio collection holds."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from ..collection import Clip, Collection
+from ..errors import InputError
+from ..tracking.landmark_model import rotations
+
+
+@dataclass(frozen=True)
+class TrackErrors:
+    """Medians over the frames of all clips unless said otherwise.
+
+    frames: compared, of `filmed`; reprojection_px: a frame's median distance of face vertices on
+    the picture, source pixels; reprojection_worst_px: its 95th percentile over frames;
+    rotation_deg: of the head to the camera; expression_mm: a frame's mean distance of the face's
+    vertices in the head's frame, each measured from its own neutral face; face_mm: the same of the
+    vertices themselves, each head laid on the other rigidly over the clips' neutral face;
+    shape_mm: mean distance of the neutral faces, laid on each other; focal_percent: mean of clips;
+    jitter: the face's mean acceleration on the picture over the truth's, frame to frame.
+    """
+
+    frames: int
+    filmed: int
+    reprojection_px: float
+    reprojection_worst_px: float
+    rotation_deg: float
+    expression_mm: float
+    face_mm: float
+    shape_mm: float
+    focal_percent: float
+    jitter: float
+
+    def row(self) -> dict[str, float]:
+        return {name: round(float(value), 4) for name, value in asdict(self).items()}
+
+
+@dataclass(eq=False)
+class _Both:
+    """A clip's face as it is and as it was found, the frames both have."""
+
+    pixels: tuple[np.ndarray, np.ndarray]  # [F,V,2] source pixels
+    local: tuple[np.ndarray, np.ndarray]  # [F,V,3] in the head's frame, metres
+    turns: tuple[np.ndarray, np.ndarray]  # [F,3,3] head to camera
+    numbers: np.ndarray  # [F]
+    focal: tuple[float, float]  # of the source frame's pixels
+
+
+def compare(truth: Collection, found: Collection) -> TrackErrors:
+    """Errors of `found`, tracked on the pictures of `truth`'s clips, name for name.
+
+    Both are of one head model, the source frames have the size of the truth's pictures, and
+    `found` says each clip's focal length in source pixels, as `track` does. Raises InputError.
+    """
+    if truth.head.fingerprint != found.head.fingerprint:
+        raise InputError(f"{found.path}: tracked with another head than {truth.path}")
+    face = np.flatnonzero(truth.head.regions["face"])
+    neutral = tuple(
+        _head_frame(c.head, c.head.shaped(c.betas), c.betas)[face] for c in (truth, found)
+    )
+    lay = _rigid(neutral[1], neutral[0])
+    laid = neutral[1] @ lay[0].T + lay[1]
+    clips = [_both(truth, found, clip.name, face) for clip in found.clips]
+    reprojection = np.concatenate([_apart(*both.pixels) for both in clips])
+    rotation = np.concatenate([_angles(*both.turns) for both in clips])
+    expression, whole, jitters = [], [], []
+    for both in clips:
+        real, seen = both.local
+        moved = np.linalg.norm((real - neutral[0]) - (seen - neutral[1]) @ lay[0].T, axis=2)
+        expression.append(moved.mean(axis=1))
+        whole.append(np.linalg.norm(seen @ lay[0].T + lay[1] - real, axis=2).mean(axis=1))
+        jitters.append([_shake(pixels, both.numbers) for pixels in both.pixels])
+    shaken = np.array(jitters).sum(axis=0)
+    return TrackErrors(
+        frames=len(reprojection),
+        filmed=sum(len(truth.clip(c.name).indices("train", "test")) for c in found.clips),
+        reprojection_px=float(np.median(reprojection)),
+        reprojection_worst_px=float(np.percentile(reprojection, 95)),
+        rotation_deg=float(np.median(rotation)),
+        expression_mm=1e3 * float(np.median(np.concatenate(expression))),
+        face_mm=1e3 * float(np.median(np.concatenate(whole))),
+        shape_mm=1e3 * float(np.linalg.norm(laid - neutral[0], axis=1).mean()),
+        focal_percent=100 * float(np.mean([abs(np.log(c.focal[1] / c.focal[0])) for c in clips])),
+        jitter=float(shaken[1] / max(shaken[0], 1e-9)),
+    )
+
+
+def _both(truth: Collection, found: Collection, name: str, face: np.ndarray) -> _Both:
+    focal = next(
+        (c["focal_pixels"] for c in found.extra.get("tracking", {}).get("clips", [])
+         if c["name"] == name),
+        None,
+    )  # fmt: skip
+    if focal is None:
+        raise InputError(f"{found.path}: says nothing of clip {name}'s focal length")
+    real, seen = truth.clip(name), found.clip(name)
+    _, a, b = np.intersect1d(real.frame_id, seen.frame_id, return_indices=True)
+    if len(a) == 0:
+        raise InputError(f"{found.path}: clip {name} shares no frame with {truth.path}")
+    sides = (
+        _seen(truth, real, a, face, float(real.intrinsics[0, 0, 0]), real),
+        _seen(found, seen, b, face, float(focal), real),
+    )
+    pixels, local, turns = zip(*sides, strict=True)
+    return _Both(pixels, local, turns, real.frame_id[a], (float(real.intrinsics[0, 0, 0]), focal))
+
+
+def _seen(
+    collection: Collection,
+    clip: Clip,
+    rows: np.ndarray,
+    face: np.ndarray,
+    focal: float,
+    source: Clip,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pixels [F,V,2] of the source frame, places [F,V,3] in the head's frame, turns [F,3,3]."""
+    vertices = collection.posed(clip, rows).astype(np.float64)
+    to_camera = np.linalg.inv(clip.camera_to_world[rows].astype(np.float64))
+    own = np.einsum("fij,fvj->fvi", to_camera[:, :3, :3], vertices) + to_camera[:, None, :3, 3]
+    centre = np.array([source.width / 2, source.height / 2])
+    pixels = own[:, face, :2] / own[:, face, 2:] * focal + centre
+    pose = clip.pose[rows].astype(np.float64)
+    head = rotations(pose[:, 0])
+    still = pose.copy()
+    still[:, 0] = 0
+    names = collection.head.joint_names
+    if "neck" in names:
+        head = head @ rotations(pose[:, names.index("neck")])
+        still[:, names.index("neck")] = 0
+    posed = collection.head.pose(
+        collection.betas,
+        clip.expression[rows],
+        still.astype(np.float32),
+        np.zeros((len(rows), 3), np.float32),
+    )
+    local = _head_frame(collection.head, posed.numpy().astype(np.float64), collection.betas)
+    return pixels, local[:, face], to_camera[:, :3, :3] @ head
+
+
+def _head_frame(head, vertices: np.ndarray, betas: np.ndarray) -> np.ndarray:
+    """Places seen from the neck joint of the identity."""
+    joint = head.joint_names.index("neck") if "neck" in head.joint_names else 0
+    return vertices - head.joints(betas)[joint].astype(np.float64)
+
+
+def _apart(real: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    return np.median(np.linalg.norm(real - seen, axis=2), axis=1)
+
+
+def _angles(real: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Degrees between rotations [F,3,3]."""
+    between = np.einsum("fij,fik->fjk", real, seen)
+    cosine = (np.trace(between, axis1=1, axis2=2) - 1) / 2
+    return np.degrees(np.arccos(cosine.clip(-1, 1)))
+
+
+def _shake(pixels: np.ndarray, numbers: np.ndarray) -> float:
+    """Summed mean length of second differences over frames that follow one another."""
+    even = np.flatnonzero((np.diff(numbers)[:-1] == 1) & (np.diff(numbers)[1:] == 1)) + 1
+    bends = pixels[even - 1] - 2 * pixels[even] + pixels[even + 1]
+    return float(np.linalg.norm(bends, axis=2).mean(axis=1).sum())
+
+
+def _rigid(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The turn [3,3] and shift [3] that lay source [V,3] on target best (Kabsch)."""
+    a, b = source.mean(axis=0), target.mean(axis=0)
+    left, _, right = np.linalg.svd((target - b).T @ (source - a))
+    flip = np.diag([1, 1, np.sign(np.linalg.det(left @ right))])
+    turn = left @ flip @ right
+    return turn, b - turn @ a

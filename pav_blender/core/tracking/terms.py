@@ -1,0 +1,199 @@
+"""What the fit wants small: landmarks that miss, and skin whose look changes as the head moves.
+
+A term belongs to one clip. It knows its weights, its residuals, and their derivatives by a frame's
+unknowns and the shared ones, in the order that `equations` uses.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from .landmark_model import LandmarkModel, PointModel, Posed
+from .photo import Pictures, sample, templates, visible
+
+# a photo residual is this likely to be new information beside its neighbours'
+_PHOTO_INDEPENDENT = 0.1
+_FLOOR = 0.05  # of a feature's units: pictures are never alike to less than that
+
+
+@dataclass(eq=False)
+class ClipFit:
+    """One clip: focal length in source pixels; root [3] constant; pose [F,J,3] with the root in
+    it; translation [F,3]; expression [F,E]."""
+
+    focal: float
+    root: np.ndarray
+    pose: np.ndarray
+    translation: np.ndarray
+    expression: np.ndarray
+
+
+class Term(Protocol):
+    """weigh: finds the weights anew; cost: their weighted squares; linearised: residuals [f,D,L]
+    and slopes [f, n + B + 4, D, L] of some rows, both times the square root of the weights."""
+
+    def weigh(self, betas: np.ndarray, fit: ClipFit) -> None: ...
+
+    def cost(self, betas: np.ndarray, fit: ClipFit) -> float: ...
+
+    def linearised(
+        self, betas: np.ndarray, fit: ClipFit, rows: slice
+    ) -> tuple[np.ndarray, np.ndarray]: ...
+
+
+def project(points: np.ndarray, focal: float) -> np.ndarray:
+    """[F,L,3], camera at the origin looking down -z -> pixels [F,L,2], y down."""
+    depth = -points[..., 2:].clip(None, -1e-3)
+    return points[..., :2] * np.array([focal, -focal]) / depth
+
+
+def project_slopes(points: np.ndarray, focal: float) -> np.ndarray:
+    """d pixels / d point, [F,L,2,3]."""
+    x, y, z = np.moveaxis(points, -1, 0)
+    z = z.clip(None, -1e-3)
+    outer = np.zeros((*points.shape[:2], 2, 3))
+    outer[..., 0, 0] = -focal / z
+    outer[..., 0, 2] = focal * x / z**2
+    outer[..., 1, 1] = focal / z
+    outer[..., 1, 2] = -focal * y / z**2
+    return outer
+
+
+def _posed(model: PointModel, betas: np.ndarray, fit: ClipFit, rows: slice = slice(None)) -> Posed:
+    return model.pose(betas, fit.expression[rows], fit.pose[rows], fit.translation[rows])
+
+
+def _slopes(
+    model: PointModel, posed: Posed, pose: np.ndarray, outer: np.ndarray, by_focal: np.ndarray
+) -> np.ndarray:
+    """[f, n + B + 4, D, L]: joints but the root, translation, expression; identity, log focal,
+    root. outer [f,L,D,3]; by_focal [f,D,L]."""
+    slopes = model.jacobian(posed, pose, outer)
+    frames, count, rows = outer.shape[:3]
+    turns = slopes.pose.reshape(frames, -1, rows, count)
+    focal = by_focal[:, None].astype(np.float32)
+    own = (turns[:, 3:], slopes.translation, slopes.expression)
+    return np.concatenate([*own, slopes.shape, focal, turns[:, :3]], axis=1)
+
+
+@dataclass(eq=False)
+class Landmarks:
+    """target [F,L,2] pixels about the picture's middle, y down; trust [F,L]; scatter in pixels."""
+
+    model: LandmarkModel
+    target: np.ndarray
+    trust: np.ndarray
+    scatter: float
+    weights: np.ndarray | None = None
+
+    def weigh(self, betas: np.ndarray, fit: ClipFit) -> None:
+        """Trust, less for what turns away from the camera and for what fits badly."""
+        posed = _posed(self.model, betas, fit)
+        facing = ((self.model.facing(posed) - 0.05) / 0.4).clip(0.03, 1)
+        distance = np.linalg.norm(project(posed.points, fit.focal) - self.target, axis=2)
+        # while everything is still far off, nothing is an outlier yet
+        usual = max(self.scatter, float(np.median(distance)))
+        robust = 1 / (1 + (distance / (4 * usual)) ** 2)
+        self.weights = self.trust * facing * robust / self.scatter**2
+
+    def cost(self, betas: np.ndarray, fit: ClipFit) -> float:
+        assert self.weights is not None
+        missed = project(_posed(self.model, betas, fit).points, fit.focal) - self.target
+        return float((self.weights[..., None] * missed**2).sum())
+
+    def linearised(
+        self, betas: np.ndarray, fit: ClipFit, rows: slice
+    ) -> tuple[np.ndarray, np.ndarray]:
+        assert self.weights is not None
+        posed = _posed(self.model, betas, fit, rows)
+        pixels = project(posed.points, fit.focal)
+        outer = project_slopes(posed.points, fit.focal)
+        by_focal = pixels.transpose(0, 2, 1)
+        slopes = _slopes(self.model, posed, fit.pose[rows], outer, by_focal)
+        root = np.sqrt(self.weights[rows])[:, None].astype(np.float32)
+        residual = (pixels - self.target[rows]).transpose(0, 2, 1).astype(np.float32)
+        return residual * root, slopes * root[:, None]
+
+    def distances(self, betas: np.ndarray, fit: ClipFit) -> np.ndarray:
+        """Median distance of a frame's landmarks, in pixels, [F]."""
+        missed = project(_posed(self.model, betas, fit).points, fit.focal) - self.target
+        return np.median(np.linalg.norm(missed, axis=2), axis=1)
+
+
+@dataclass(eq=False)
+class Photo:
+    """A clip's pictures at points of the face, against what the clip shows there on the whole.
+
+    `shared` [L] is what all clips show there, NaN where they do not agree; `template` [L] is found
+    by `look`, which must precede the first use.
+    """
+
+    model: PointModel
+    pictures: Pictures
+    weight: float = 1.0
+    template: np.ndarray | None = None
+    certainty: np.ndarray | None = None
+    weights: np.ndarray | None = None
+    seen: np.ndarray | None = None
+
+    def look(self, betas: np.ndarray, fit: ClipFit) -> None:
+        """Finds what is visible, and each point's usual look over the frames."""
+        posed = _posed(self.model, betas, fit)
+        facing = ((self.model.facing(posed) - 0.2) / 0.5).clip(0, 1)
+        self.seen = facing * visible(self.model, betas, fit, posed.points, self.pictures)
+        values, _, inside = sample(self.pictures, project(posed.points, fit.focal))
+        self.template, self.certainty = templates(values, self.seen * inside)
+
+    def lean(self, shared: np.ndarray, share: float) -> None:
+        """Moves the template by `share` toward `shared` [L], less where it differs much."""
+        assert self.template is not None
+        apart = np.nan_to_num(shared - self.template)
+        self.template = self.template + share * apart / (1 + (apart / 0.5) ** 2)
+
+    def weigh(self, betas: np.ndarray, fit: ClipFit) -> None:
+        residual, _, inside = self._residual(betas, fit)
+        assert self.seen is not None
+        base = self.seen * inside
+        usual = 1.48 * float(np.median(np.abs(residual[base > 0.5]))) if (base > 0.5).any() else 1.0
+        usual = max(usual, _FLOOR)
+        robust = 1 / (1 + (residual / (2 * usual)) ** 2) ** 2
+        self.weights = self.weight * _PHOTO_INDEPENDENT * base * robust / usual**2
+
+    def cost(self, betas: np.ndarray, fit: ClipFit) -> float:
+        residual, _, inside = self._residual(betas, fit)
+        assert self.weights is not None
+        # a point that leaves the picture costs as a bad one does, lest leaving should pay
+        return float((self.weights * np.where(inside, residual, 1.0) ** 2).sum())
+
+    def linearised(
+        self, betas: np.ndarray, fit: ClipFit, rows: slice
+    ) -> tuple[np.ndarray, np.ndarray]:
+        assert self.weights is not None
+        assert self.template is not None
+        posed = _posed(self.model, betas, fit, rows)
+        pixels = project(posed.points, fit.focal)
+        values, gradient, inside = sample(self.pictures, pixels, rows)
+        outer = (gradient[..., None, :] @ project_slopes(posed.points, fit.focal)).astype(
+            np.float32
+        )
+        by_focal = (gradient * pixels).sum(axis=2)[:, None]
+        slopes = _slopes(self.model, posed, fit.pose[rows], outer, by_focal)
+        root = np.sqrt(self.weights[rows] * inside)[:, None].astype(np.float32)
+        residual = (values - self.template)[:, None].astype(np.float32)
+        return residual * root, slopes * root[:, None]
+
+    def _residual(
+        self, betas: np.ndarray, fit: ClipFit
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        assert self.template is not None
+        posed = _posed(self.model, betas, fit)
+        values, gradient, inside = sample(self.pictures, project(posed.points, fit.focal))
+        return values - self.template, gradient, inside
+
+
+def with_weight(term: Landmarks, factor: float) -> Landmarks:
+    """The same landmarks, trusted `factor` times as much."""
+    return replace(term, trust=term.trust * factor, weights=None)

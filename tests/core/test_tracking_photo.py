@@ -1,0 +1,170 @@
+"""Photo-consistency on the studio's own pictures, whose truth is known."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pav_blender.core.collection import read_collection
+from pav_blender.core.images import read_rgba
+from pav_blender.core.tracking import photo
+from pav_blender.core.tracking.fit import HeadFit, refine_head
+from pav_blender.core.tracking.landmark_model import LandmarkModel, axis_angles, rotations
+from pav_blender.core.tracking.observe import Observations
+from pav_blender.core.tracking.terms import ClipFit, Photo, project
+
+STUDIO = Path(__file__).parents[2] / "data" / "studio3"
+FRAMES = 24
+
+
+@pytest.fixture(scope="module")
+def filmed():
+    """A studio clip: its truth as a fit, its frames, and landmarks without an error."""
+    collection = read_collection(STUDIO)
+    clip = collection.clip("crop")
+    rows = clip.indices("train")[:FRAMES]
+    head, flip = collection.head, np.diag([1.0, -1.0, -1.0])
+    to_camera = np.linalg.inv(clip.camera_to_world[rows].astype(np.float64))
+    pose = clip.pose[rows].astype(np.float64)
+    joints = head.joints(collection.betas).astype(np.float64)
+    turn = flip @ to_camera[:, :3, :3]
+    shift = to_camera[:, :3, 3] @ flip
+    body = turn @ rotations(pose[:, 0])
+    root = axis_angles(body[FRAMES // 2])
+    own = pose.copy()
+    own[:, 0] = root
+    own[:, 1] = axis_angles(rotations(root).T @ body @ rotations(pose[:, 1]))
+    bone = joints[1] - joints[0]
+    neck = rotations(pose[:, 0]) @ bone + joints[0] + clip.translation[rows]
+    neck = np.einsum("fij,fj->fi", turn, neck) + shift
+    translation = neck - (rotations(root) @ bone + joints[0])
+    focal = float(clip.intrinsics[0, 0, 0])
+    fit = ClipFit(focal, root, own, translation, clip.expression[rows].astype(np.float64))
+    pictures = []
+    for row in rows:
+        rgba = read_rgba(collection.image_path(clip, int(row))).astype(np.float32)
+        rgb = rgba[..., :3] * (rgba[..., 3:] / 255) + 110 * (1 - rgba[..., 3:] / 255)
+        pictures.append(rgb.astype(np.uint8))
+    model = LandmarkModel(head, len(collection.betas))
+    seen = _seen(model, collection.betas, fit, clip.width)
+    return head, np.asarray(collection.betas, np.float64), fit, seen, pictures
+
+
+def _seen(model, betas, fit, side):
+    points = model.pose(betas, fit.expression, fit.pose, fit.translation).points
+    pixels = project(points, fit.focal) + side / 2
+    landmarks = np.concatenate([pixels, np.zeros_like(pixels[..., :1])], axis=2)
+    numbers = np.arange(len(pixels), dtype=np.int32)
+    return Observations(landmarks.astype(np.float32), None, (), numbers, [], side, side)
+
+
+def _windows(seen, pictures):
+    return photo.windows(pictures, seen.landmarks, seen.width, seen.height)
+
+
+def _turned_wrong(fit, degrees):
+    """Each frame's head turned by an error of its own about its neck."""
+    wrong = np.radians(np.random.default_rng(5).normal(0, degrees, (FRAMES, 3)))
+    pose = fit.pose.copy()
+    pose[:, 1] = axis_angles(rotations(pose[:, 1]) @ rotations(wrong))
+    return replace(fit, pose=pose)
+
+
+def _turn_errors(fit, truth):
+    """Degrees, apart from what is the same in all frames."""
+    between = np.swapaxes(rotations(truth.pose[:, 1]), 1, 2) @ rotations(fit.pose[:, 1])
+    turns = axis_angles(between)
+    return np.degrees(np.linalg.norm(turns - np.median(turns, axis=0), axis=1))
+
+
+def test_pictures_mend_what_landmarks_get_wrong(filmed):
+    """Landmarks that lie about each frame's turn: the skin tells it better."""
+    head, betas, truth, seen, pictures = filmed
+    wrong = _turned_wrong(truth, 1.5)
+    lied = _seen(LandmarkModel(head, len(betas)), betas, wrong, seen.width)
+    start = HeadFit(betas, [wrong], [], [])
+    found = refine_head(head, [lied], start, [_windows(seen, pictures)], rates=[10.0])
+    before, after = _turn_errors(wrong, truth), _turn_errors(found.clips[0], truth)
+    assert np.median(before) > 1.5
+    assert np.median(after) < 0.6 * np.median(before)
+
+
+def test_pictures_leave_the_truth_alone(filmed):
+    head, betas, truth, seen, pictures = filmed
+    start = HeadFit(betas, [truth], [], [])
+    found = refine_head(head, [seen], start, [_windows(seen, pictures)], rates=[10.0])
+    assert np.median(_turn_errors(found.clips[0], truth)) < 0.5
+    shown = _seen(LandmarkModel(head, len(betas)), found.betas, found.clips[0], seen.width)
+    off = np.linalg.norm(shown.landmarks - seen.landmarks, axis=2)
+    assert np.median(off) < 0.7
+
+
+def test_the_face_looks_more_alike_where_the_head_truly_is(filmed):
+    head, betas, truth, seen, pictures = filmed
+    points = photo.face_points(head, len(betas))
+
+    def unlike(fit):
+        term = Photo(points, _windows(seen, pictures))
+        term.look(betas, fit)
+        residual, _, inside = term._residual(betas, fit)
+        return np.median(np.abs(residual[(term.seen > 0.5) & inside]))
+
+    assert unlike(truth) < 0.8 * unlike(_turned_wrong(truth, 1.5))
+
+
+def test_photo_slopes_are_the_costs(filmed):
+    """The gradient that `linearised` gives against differences of the cost."""
+    head, betas, truth, seen, pictures = filmed
+    fit = _turned_wrong(truth, 1.0)
+    term = Photo(photo.face_points(head, len(betas)), _windows(seen, pictures))
+    term.look(betas, fit)
+    term.weigh(betas, fit)
+    residual, slopes = term.linearised(betas, fit, slice(0, 1))
+    gradient = 2 * (slopes[0].reshape(len(slopes[0]), -1) @ residual[0].ravel())
+    for column, axis, step in ((1, 1, 1e-4), (0, 0, 1e-4)):  # the neck's turn and nod
+        costs = []
+        for sign in (1, -1):
+            pose = fit.pose.copy()
+            pose[0, 1, axis] += sign * step
+            costs.append(term.cost(betas, replace(fit, pose=pose)))
+        assert gradient[column] == pytest.approx((costs[0] - costs[1]) / (2 * step), rel=0.1)
+
+
+def test_a_hand_before_the_face_does_not_enter_the_template():
+    random = np.random.default_rng(0)
+    look = random.normal(0, 1, 50)
+    values = look + random.normal(0, 0.02, (20, 50))
+    values[:5, :20] = 3.0
+    found, _ = photo.templates(values, np.ones_like(values))
+    assert np.abs(found - look).max() < 0.1
+    assert np.abs(values.mean(axis=0) - look).max() > 0.3
+
+
+def test_points_of_the_far_cheek_are_hidden(filmed):
+    head, betas, truth, seen, pictures = filmed
+    points = photo.face_points(head, len(betas))
+    pose = truth.pose.copy()
+    pose[:, 0] = 0
+    pose[:, 1] = (0, np.radians(75), 0)
+    fit = replace(truth, pose=pose)
+    posed = points.pose(betas, fit.expression, fit.pose, fit.translation)
+    looked = _seen(LandmarkModel(head, len(betas)), betas, fit, seen.width)
+    windows = photo.windows(pictures, looked.landmarks, seen.width, seen.height)
+    shown = photo.visible(points, betas, fit, posed.points, windows)[0]
+    side = (head.template[points.corners].mean(axis=1))[:, 0]
+    assert shown[side < -0.04].mean() > 0.8
+    assert shown[side > 0.04].mean() < 0.3
+
+
+def test_a_window_may_reach_beyond_the_frame():
+    frame = np.full((40, 30, 3), 90, np.uint8)
+    landmarks = np.zeros((1, 478, 3), np.float32)
+    landmarks[0, :, 0] = np.linspace(-10, 50, 478)
+    landmarks[0, :, 1] = np.linspace(-20, 60, 478)
+    pictures = photo.windows([frame], landmarks, 30, 40)
+    assert pictures.features.shape == (1, photo.SIDE, photo.SIDE)
+    values, gradient, inside = photo.sample(pictures, np.array([[[0.0, 0.0], [500.0, 0.0]]]))
+    assert inside.tolist() == [[True, False]]
+    assert np.isfinite(values).all()
+    assert (gradient == 0).all()
