@@ -28,7 +28,7 @@ SCORE_SPREAD = 0.3
 # are weighed: a portrait's field of view (some 42 degrees, unless the video was cropped before)
 # and the distance one is filmed from; spreads are of logarithms.
 FOCAL_OF_SIDE, FOCAL_OF_SIDE_SPREAD = 1.3, 0.6
-METRES_AWAY, METRES_AWAY_SPREAD = 1.0, 0.3
+METRES_AWAY, METRES_AWAY_SPREAD = 1.2, 0.3
 FOCAL_SPREAD = 0.3
 ROOT_SPREAD, NECK_SPREAD = 0.12, 0.25
 # A landmark's place on the head is itself uncertain, and no number of frames cures that: so many
