@@ -21,8 +21,8 @@ from scipy.optimize import linear_sum_assignment
 from pav_blender.core.collection import Clip, Collection, read_collection
 from pav_blender.core.head import HeadModel
 from pav_blender.core.images import read_rgba
+from pav_blender.core.tracking.detectors import Detector, make_detector
 from pav_blender.core.tracking.landmark_model import OFFSETS_PATH, rotations
-from pav_blender.core.tracking.observe import Detector, make_detector
 from pav_blender.studio import DEFAULT_COLLECTION
 
 _GREY = 0.45  # the background the pictures are laid on
@@ -39,7 +39,7 @@ def main() -> int:
     for path in arguments.collections:
         collection = read_collection(path)
         for clip in collection.clips:
-            for model in {None, arguments.landmark_model}:
+            for model in dict.fromkeys((None, arguments.landmark_model)):
                 detector = make_detector(model)
                 found = clip_offsets(collection, clip, detector)
                 detector.close()
@@ -65,12 +65,13 @@ def clip_offsets(collection: Collection, clip: Clip, detector: Detector) -> np.n
         found = detector((rgb * 255 + 0.5).astype(np.uint8))
         if found is None:
             continue
-        points = head.landmarks(collection.posed(clip, np.array([row]))[0].astype(np.float64))
+        vertices = collection.posed(clip, np.array([row]))[0].astype(np.float64)
+        points = np.asarray(head.landmarks(vertices))
         camera = np.linalg.inv(clip.camera_to_world[row].astype(np.float64))
         own = points @ camera[:3, :3].T + camera[:3, 3]
         focal = clip.intrinsics[row][[0, 1], [0, 1]]
         pixels = own[:, :2] / own[:, 2:] * focal + clip.intrinsics[row][:2, 2]
-        missed = (found[0][:, :2] * clip.width - pixels) / focal * own[:, 2:]
+        missed = (np.asarray(found[0])[:, :2] * clip.width - pixels) / focal * own[:, 2:]
         pose = clip.pose[row].astype(np.float64)
         axes = (camera[:3, :3] @ rotations(pose[0]) @ rotations(pose[neck]))[:2]
         matrix += axes.T @ axes + _STIFF * np.eye(3)

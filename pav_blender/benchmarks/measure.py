@@ -23,13 +23,14 @@ from ..studio import DEFAULT_COLLECTION
 @dataclass(frozen=True)
 class Options:
     """out: folder of what is written; minutes: of the longest training, "train" only; iterations:
-    of the subject's training, the same work on every machine."""
+    of the subject's training, the same work on every machine; landmark_model: of "track"."""
 
     out: Path
     collection: Path = DEFAULT_COLLECTION
     repeats: int = 3
     minutes: float = 8.0
     iterations: int = 3000
+    landmark_model: Path | None = None
 
 
 def collection_of(options: Options) -> Collection:

@@ -13,7 +13,7 @@ from ..studio import DEFAULT_COLLECTION
 SUMMARY = "Measure speed against error on a studio avatar; tables, plots and claims."
 EXAMPLE = "pav bench render --out out/bench --check"
 
-NAMES = ("render", "train", "kernels", "scale", "memory", "devices", "matte")
+NAMES = ("render", "train", "kernels", "scale", "memory", "devices", "matte", "track")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -27,6 +27,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=8.0,
         help="of the paper's preset in `train`, of each training in `devices`",
     )
+    parser.add_argument(
+        "--landmark-model", type=Path, metavar="FILE.task", help="`track`: as for pav track"
+    )
     parser.add_argument("--check", action="store_true", help="exit 1 where a claim is not met")
 
 
@@ -38,7 +41,13 @@ def run(args: argparse.Namespace) -> int:
     if args.repeats < 1 or not args.minutes > 0:
         raise InputError("--repeats takes 1 or more, --minutes more than 0")
     args.out.mkdir(parents=True, exist_ok=True)
-    options = Options(args.out, args.collection or DEFAULT_COLLECTION, args.repeats, args.minutes)
+    options = Options(
+        args.out,
+        args.collection or DEFAULT_COLLECTION,
+        args.repeats,
+        args.minutes,
+        landmark_model=args.landmark_model,
+    )
     module = importlib.import_module(f"...benchmarks.{args.name}", __name__)
     fields, claims = module.run(options, Progress("train", as_json=args.json_progress))
     fields |= {"versions": versions(), "machine": machine()}

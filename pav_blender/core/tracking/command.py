@@ -60,6 +60,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="split",
         help="split a video where it was cut, each shot becoming a clip, or take it as one",
     )
+    parser.add_argument(
+        "--fit",
+        choices=("photo", "landmarks"),
+        default="photo",
+        help="follow the skin between the landmarks too, or the landmarks alone (sooner)",
+    )
     parser.add_argument("--overwrite", action="store_true", help="replace an older collection")
 
 
@@ -77,6 +83,7 @@ def run(args: argparse.Namespace, should_stop: ShouldStop | None = None) -> int:
             model=args.landmark_model,
             cut_background=args.matte == "segment",
             cuts=args.cuts == "split",
+            photo=args.fit == "photo",
             overwrite=args.overwrite,
             progress=Progress("track", as_json=getattr(args, "json_progress", False)),
             should_stop=should_stop,

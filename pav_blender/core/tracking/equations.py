@@ -18,8 +18,8 @@ _HELD = 1e9  # stiffness of what may not move
 @dataclass(eq=False)
 class Expected:
     """What is expected of a clip beforehand: the focal length in pixels; mean [F,n] and weight [n]
-    of a frame's unknowns; steady [n], the weight on second differences over time at `triples`,
-    rows i with i-1, i, i+1 evenly spaced."""
+    of a frame's unknowns; steady [T,n], the weight on second differences over time at `triples`
+    [T], rows i with i-1, i, i+1 evenly spaced."""
 
     focal: float
     mean: np.ndarray

@@ -26,12 +26,12 @@ _COARSE_FRAMES, _COARSE_STEPS, _FINE_STEPS = 40, 10, 5
 # blur of the pictures in pixels of a face's window, and steps with it
 _PHOTO_LEVELS = ((6.0, 4), (3.0, 4), (0.0, 4))
 # once pictures speak, landmarks only say where on the face the skin is
-_LANDMARKS_LEFT = 0.02
+_LANDMARKS_LEFT = 0.05
 # of the way from a clip's own look to what all clips show
 _SHARED = 0.7
 _FOREHEAD, _CHIN = 10, 152
 _LEFT_PUPIL, _RIGHT_PUPIL = 473, 468
-_USUAL_RATE = 30.0
+USUAL_RATE = 30.0
 
 
 @dataclass(eq=False)
@@ -72,7 +72,7 @@ def fit_head(
     """
     model = LandmarkModel(head, shapes)
     prior = priors.frame_prior(head)
-    rates = rates or [_USUAL_RATE] * len(seen)
+    rates = rates or [USUAL_RATE] * len(seen)
     state = _State(np.zeros(model.shapes), [])
     sparse = [np.arange(0, len(clip), -(-len(clip) // _COARSE_FRAMES)) for clip in seen]
     coarse = [clip.subset(rows) for clip, rows in zip(seen, sparse, strict=True)]
@@ -115,7 +115,7 @@ def refine_head(
     model = LandmarkModel(head, len(fit.betas))
     points = face_points(head, len(fit.betas))
     prior = priors.frame_prior(head)
-    rates = rates or [_USUAL_RATE] * len(seen)
+    rates = rates or [USUAL_RATE] * len(seen)
     problem = Problem(model, prior, [], [])
     photos: list[Photo] = []
     firm = []
@@ -250,13 +250,13 @@ def _prepare(
 def _steadiness(
     frame_id: np.ndarray, prior: priors.FramePrior, rate: float | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rows that stand evenly between their neighbours, and the weight on their accelerations."""
+    """Rows that stand evenly between their neighbours [T], and the weight on each one's
+    accelerations [T,n]."""
     gaps = np.diff(frame_id.astype(np.int64))
-    usual = int(np.median(gaps)) if len(gaps) else 1
-    even = (gaps[:-1] == usual) & (gaps[1:] == usual) & (rate is not None)
+    even = np.flatnonzero((gaps[:-1] == gaps[1:]) & (rate is not None))
     # what a head does between two frames grows with the square of the time between them
-    longer = max(1.0, (usual * _USUAL_RATE / (rate or _USUAL_RATE)) ** 2)
-    return np.flatnonzero(even) + 1, prior.steady / longer**2
+    longer = np.maximum(1.0, (gaps[even] * USUAL_RATE / (rate or USUAL_RATE)) ** 2)
+    return even + 1, prior.steady / longer[:, None] ** 2
 
 
 def _first_guess(

@@ -11,18 +11,21 @@ import numpy as np
 
 from ..collection import CollectionWriter
 from ..errors import InputError
-from ..head import load_head
+from ..head import HeadModel, load_head
 from ..progress import Report
 from . import detectors
 from .cache import Cache
-from .fit import ClipFit, fit_head
+from .fit import USUAL_RATE, HeadFit, fit_head, refine_head
 from .looking import Shot, Take, choose_shots, sight
+from .photo import windows as face_windows
 from .pictures import open_source
 from .sift import NO_FIT
-from .write import ShouldStop, Track, clip_of, write_pictures
+from .terms import ClipFit
+from .write import ShouldStop, Track, clip_of, frames_of, write_pictures
 
 # parts of the whole work, as they were measured
-_OBSERVING, _FITTING = 0.45, 0.2
+_OBSERVING, _FITTING = 0.4, 0.35
+_LANDMARKS_SHARE = 0.4  # of the fitting
 # a frame whose median landmark misses by more than both does not show the face it should
 _WORST_OF_MEDIAN, _WORST_OF_EYES = 3.0, 0.08
 
@@ -55,6 +58,7 @@ def track(
     model: Path | str | None = None,
     cut_background: bool = True,
     cuts: bool = True,
+    photo: bool = True,
     overwrite: bool = False,
     progress: Report | None = None,
     should_stop: ShouldStop | None = None,
@@ -65,8 +69,9 @@ def track(
     frames are looked at; max_frames: of these so many a shot, as different as can be; appearances:
     one name a video, or "NAME=video,video" (default: the files' names); head: "builtin" or a head
     file; model: a MediaPipe face landmarker `.task` file; cut_background: False writes pictures
-    opaque; cuts: whether a video is split where it was cut; progress(fraction, step=what). The last
-    tenth of every clip becomes its test split. Raises InputError for videos that cannot be read or
+    opaque; cuts: whether a video is split where it was cut; photo: whether the fit to the landmarks
+    is refined by the pictures; progress(fraction, step=what). The last tenth of every clip becomes
+    its test split. Raises InputError for videos that cannot be read or
     show no face, and Cancelled; then `out` is not there, and `out`.partial keeps what was found:
     the same call goes on from it.
     """
@@ -88,14 +93,17 @@ def track(
         seen = sight(source, every, model, cache, tell_frames, should_stop)
         takes.append(Take(source, seen, every, names[index], looks[index]))
     looked = choose_shots(takes, max_frames, cuts=cuts)
-    fit = fit_head(
-        head_model,
-        [shot.seen for shot in looked.shots],
-        progress=lambda done: tell(_OBSERVING + _FITTING * done, step="fitting the head"),
-        should_stop=should_stop,
+    fits = fit_shots(
+        head_model, looked.shots, photo, _part(tell, _OBSERVING, _FITTING), should_stop
     )
+    fit = fits[-1]
     tracks = [
-        _finish(shot, fit.clips[index], fit.errors[index], fit.eye_distances[index])
+        _finish(
+            shot,
+            fit.clips[index],
+            (fits[0].errors[index], fit.errors[index]),
+            fit.eye_distances[index],
+        )
         for index, shot in enumerate(looked.shots)
     ]
     reports = [track.report for track in tracks]
@@ -125,6 +133,44 @@ def track(
     cache.remove()
     tell(1.0, step="done")
     return TrackReport(out, reports, looked.skipped, warnings)
+
+
+def fit_shots(
+    head: HeadModel,
+    shots: Sequence[Shot],
+    photo: bool,
+    tell: Report,
+    should_stop: ShouldStop | None = None,
+) -> list[HeadFit]:
+    """The fit to the shots' landmarks, and with `photo` then the one refined by their pictures."""
+    seen = [shot.seen for shot in shots]
+    rates = [shot.source.rate or USUAL_RATE for shot in shots]
+    share = _LANDMARKS_SHARE if photo else 1.0
+    fit = fit_head(
+        head,
+        seen,
+        rates=rates,
+        progress=lambda done: tell(share * done, step="fitting the head"),
+        should_stop=should_stop,
+    )
+    if not photo:
+        return [fit]
+    pictures = []
+    for shot in shots:
+        frames = (rgb for _, rgb in frames_of(shot, np.arange(len(shot.seen)), should_stop))
+        pictures.append(
+            face_windows(frames, shot.seen.landmarks, shot.seen.width, shot.seen.height)
+        )
+    refined = refine_head(
+        head,
+        seen,
+        fit,
+        pictures,
+        rates=rates,
+        progress=lambda done: tell(share + (1 - share) * done, step="following the skin"),
+        should_stop=should_stop,
+    )
+    return [fit, refined]
 
 
 def _silent(fraction: float, **fields: object) -> None:
@@ -189,10 +235,16 @@ def _counted(tell: Report, expected: int, name: str) -> Callable[[int], None]:
     return lambda done: tell(min(1.0, done / (expected or 500)), step=f"looking at {name}")
 
 
-def _finish(shot: Shot, fit: ClipFit, errors: np.ndarray, eye_distance: float) -> Track:
-    """Leaves out frames whose landmarks the head cannot follow: most often an occluded face."""
-    limit = max(_WORST_OF_MEDIAN * float(np.median(errors)), _WORST_OF_EYES * eye_distance)
-    rows = np.flatnonzero(errors <= limit)
+def _finish(
+    shot: Shot, fit: ClipFit, both: tuple[np.ndarray, np.ndarray], eye_distance: float
+) -> Track:
+    """Leaves out frames whose landmarks the head cannot follow: most often an occluded face.
+
+    both: errors [F] of the fit to landmarks alone, which tells such frames, and of the last one.
+    """
+    alone, errors = both
+    limit = max(_WORST_OF_MEDIAN * float(np.median(alone)), _WORST_OF_EYES * eye_distance)
+    rows = np.flatnonzero(alone <= limit)
     kept = ClipFit(fit.focal, fit.root, fit.pose[rows], fit.translation[rows], fit.expression[rows])
     left_out = dict(shot.left_out)
     if len(rows) < len(errors):

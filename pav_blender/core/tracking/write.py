@@ -16,10 +16,11 @@ from ..rendering.rasterise import rasterise
 from . import labels, matte
 from .cache import Cache, key_of
 from .crop import cut
-from .fit import ClipFit, world
+from .fit import world
 from .landmark_model import RIGID
 from .looking import Shot
 from .spread import splits
+from .terms import ClipFit
 
 ShouldStop = Callable[[], bool]
 _CHUNK = 128  # masks between two savings
@@ -73,8 +74,16 @@ def windows(
     """The windows of a shot's frames `rows` (of `shot.seen`, ascending), read from its source
     again: float32 [side, side, 3] in [0, 1], in order. Raises Cancelled, and InputError where the
     source has changed since."""
+    for row, rgb in frames_of(shot, rows, should_stop):
+        yield cut(rgb, shot.crop.corners[row], shot.crop.side, side)
+
+
+def frames_of(
+    shot: Shot, rows: np.ndarray, should_stop: ShouldStop | None = None
+) -> Iterator[tuple[int, np.ndarray]]:
+    """A row and its whole frame, uint8 [H, W, 3]; otherwise as `windows`."""
     numbers = shot.seen.frame_id[rows]
-    row_of = {int(number): row for number, row in zip(numbers, rows, strict=True)}
+    row_of = {int(number): int(row) for number, row in zip(numbers, rows, strict=True)}
     given = 0
     for frame in shot.source.frames(shot.every, int(numbers[0]), int(numbers[-1]) + 1):
         row = row_of.get(frame.number)
@@ -83,7 +92,7 @@ def windows(
         if should_stop is not None and should_stop():
             raise Cancelled("tracking stopped; the same command goes on from here")
         given += 1
-        yield cut(frame.rgb, shot.crop.corners[row], shot.crop.side, side)
+        yield row, frame.rgb
     if given < len(rows):
         raise InputError(f"{shot.source.path}: changed while it was read; track it again")
 
