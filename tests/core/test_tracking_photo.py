@@ -8,6 +8,7 @@ import pytest
 
 from pav_blender.core.collection import read_collection
 from pav_blender.core.images import read_rgba
+from pav_blender.core.tracking import fit as fitting
 from pav_blender.core.tracking import photo
 from pav_blender.core.tracking.fit import HeadFit, refine_head
 from pav_blender.core.tracking.landmark_model import LandmarkModel, axis_angles, rotations
@@ -15,7 +16,7 @@ from pav_blender.core.tracking.observe import Observations
 from pav_blender.core.tracking.terms import ClipFit, Photo, project
 
 STUDIO = Path(__file__).parents[2] / "data" / "studio3"
-FRAMES = 24
+FRAMES = 16
 
 
 @pytest.fixture(scope="module")
@@ -78,8 +79,10 @@ def _turn_errors(fit, truth):
     return np.degrees(np.linalg.norm(turns - np.median(turns, axis=0), axis=1))
 
 
-def test_pictures_mend_what_landmarks_get_wrong(filmed):
-    """Landmarks that lie about each frame's turn: the skin tells it better."""
+def test_pictures_mend_what_landmarks_get_wrong(filmed, monkeypatch):
+    """Landmarks that lie about each frame's turn: the skin tells it better, if it is listened to
+    alone (landmarks without scatter weigh more than a detector's)."""
+    monkeypatch.setattr(fitting, "_LANDMARKS_LEFT", 0.001)
     head, betas, truth, seen, pictures = filmed
     wrong = _turned_wrong(truth, 1.5)
     lied = _seen(LandmarkModel(head, len(betas)), betas, wrong, seen.width)
@@ -87,7 +90,7 @@ def test_pictures_mend_what_landmarks_get_wrong(filmed):
     found = refine_head(head, [lied], start, [_windows(seen, pictures)], rates=[10.0])
     before, after = _turn_errors(wrong, truth), _turn_errors(found.clips[0], truth)
     assert np.median(before) > 1.5
-    assert np.median(after) < 0.6 * np.median(before)
+    assert np.median(after) < 0.5 * np.median(before)
 
 
 def test_pictures_leave_the_truth_alone(filmed):
