@@ -88,7 +88,13 @@ def run(options: Options, progress: Report | None = None) -> tuple[dict[str, Any
 def _enlarged(collection: Collection, path: Path, progress: Report | None) -> None:
     """Clips of `_FRAMES` frames of `_SIZE` pixels: those of the collection, enlarged and over
     again. What a picture shows does not change what it takes."""
-    with CollectionWriter(path, collection.head_name, collection.betas) as writer:
+    with CollectionWriter(
+        path,
+        collection.head_name,
+        collection.betas,
+        fingerprint=collection.head.fingerprint,
+        offset=collection.head_offset,
+    ) as writer:
         for number in range(_CLIPS):
             source = collection.clips[number % len(collection.clips)]
             own = source.indices("train")

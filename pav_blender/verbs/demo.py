@@ -143,7 +143,12 @@ def _scene(args: argparse.Namespace, collection: Any, steps: Steps) -> None:
         with steps.time("scene"):
             motion = out / "motion"
             with CollectionWriter(
-                motion, collection.head_name, collection.betas, overwrite=motion.exists()
+                motion,
+                collection.head_name,
+                collection.betas,
+                fingerprint=collection.head.fingerprint,
+                offset=collection.head_offset,
+                overwrite=motion.exists(),
             ) as writer:
                 writer.clip(clip)
             _child("scene", out / "avatar.pav", "--track", f"{motion}:{clip.name}", "--out", blend)

@@ -1,3 +1,4 @@
+import dataclasses
 import json
 import shutil
 
@@ -9,6 +10,7 @@ from pav_blender.core.collection import CollectionWriter, read_collection
 from pav_blender.core.errors import InputError
 from pav_blender.core.evaluation.check import check
 from pav_blender.core.evaluation.review import write_overlays
+from pav_blender.core.head import remember_head, write_head
 from pav_blender.core.images import read_rgba
 
 
@@ -156,3 +158,27 @@ def test_what_a_tracker_left_out_is_read_with_care(toy):
     for broken in (None, 3, [], {"clips": 5}, {"clips": [1], "skipped": "x"}):
         assert told(broken) == []
     assert told({"clips": [{"name": "a", "left_out": {"x": 1, "y": []}}]}) == []
+
+
+def test_a_collection_and_its_head_file_may_be_moved(toy, tmp_path, monkeypatch):
+    """Together, or the collection alone where the head was remembered; else one line says it."""
+    monkeypatch.setenv("PAV_CONFIG", str(tmp_path / "config"))
+    head = dataclasses.replace(toy.head, name="other", shape_basis=0.5 * toy.head.shape_basis)
+    (tmp_path / "a").mkdir()
+    write_head(tmp_path / "a/head.npz", head)
+    empty = tmp_path / "elsewhere"
+    empty.mkdir()
+    monkeypatch.chdir(tmp_path)
+    known = head.fingerprint
+    with CollectionWriter("a/c", "a/head.npz", np.zeros(2), fingerprint=known) as writer:
+        writer.clip(toy.clips[0])
+    monkeypatch.chdir(empty)
+    (tmp_path / "a").rename(tmp_path / "b")
+    moved = read_collection(tmp_path / "b/c")
+    assert moved.head.fingerprint == known
+    assert moved.head_name == str(tmp_path / "b/head.npz")
+    (tmp_path / "b/c").rename(empty / "c")
+    with pytest.raises(InputError, match="pav import --head FILE"):
+        read_collection(empty / "c")
+    remember_head(tmp_path / "b/head.npz")
+    assert read_collection(empty / "c").head.fingerprint == known

@@ -33,7 +33,9 @@ def film(
     pose_at[:3, 3] = 0, -0.04, 0.8
     lens = np.array([[2.3 * size, 0, size / 2], [0, 2.3 * size, size / 2], [0, 0, 1]])
     camera = Camera(size, size, lens, pose_at)
-    with CollectionWriter(path, str(head_path), np.zeros(0)) as writer:
+    with CollectionWriter(
+        path, str(head_path), np.zeros(0), fingerprint=head.fingerprint
+    ) as writer:
         for look, name in enumerate(LOOKS):
             time = np.linspace(0, 2 * np.pi, frames, endpoint=False)
             pose = np.zeros((frames, len(head.joint_names), 3), np.float32)

@@ -58,7 +58,7 @@ def read_collection(path: Path | str) -> Collection:
     if len({entry[0] for entry in entries}) < len(entries):
         raise InputError(f"{meta_path}: two clips have the same name")
     try:
-        head = load_head(head_name, fingerprint)
+        head = load_head(head_name, fingerprint, beside=path)
     except InputError as error:
         raise InputError(f"{meta_path}: {error}") from error
     if len(betas) > len(head.shape_basis) or not np.isfinite(betas).all():
@@ -71,6 +71,8 @@ def read_collection(path: Path | str) -> Collection:
         head = head.with_offset(offset)
     clips = [_read_clip(path, head, *entry) for entry in entries]
     extra = dict(meta.get("extra") or {})
+    if (path / head_name).exists():  # a head file, which other folders call otherwise
+        head_name = str((path / head_name).resolve())
     return Collection(path, head_name, head, betas, clips, extra, offset)
 
 

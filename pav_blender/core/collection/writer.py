@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
 import tempfile
@@ -13,6 +14,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..files import replacing, write_text
+from ..head.builtin import BUILTIN
 from ..images import write_gray, write_rgba
 from .model import FORMAT, SPLITS, VERSION, Clip
 
@@ -30,14 +32,24 @@ def check_name(name: str, what: str) -> str:
     return name
 
 
+def _name_from(folder: Path, head_name: str) -> str:
+    if head_name == BUILTIN or not Path(head_name).exists():
+        return head_name
+    try:
+        return Path(os.path.relpath(Path(head_name).resolve(), folder.resolve())).as_posix()
+    except ValueError:  # another drive
+        return str(Path(head_name).resolve())
+
+
 class CollectionWriter:
     """Context manager: `root` is the folder being written, `path` where it goes at the end.
 
     An error inside the block removes what was written. Raises InputError where `path` exists,
     unless `overwrite` says to replace a collection (and nothing but a collection).
 
-    fingerprint: the head's, where it is not found by its name alone; offset [V, 3] metres: what the
-    person has beside the betas.
+    head_name: "builtin", a head file, which is named from the collection's folder so that both may
+    be moved together, or the name of a head that is found by its `fingerprint`. offset [V, 3]
+    metres: what the person has beside the betas.
     """
 
     def __init__(
@@ -55,7 +67,8 @@ class CollectionWriter:
         if self.path.exists() and not (overwrite and (self.path / "collection.json").is_file()):
             what = "is not a collection" if overwrite else "exists already"
             raise InputError(f"{self.path}: {what}; choose another folder or remove it")
-        head: dict = {"name": head_name, "betas": [float(b) for b in np.ravel(betas)]}
+        name = _name_from(self.path, head_name)
+        head: dict = {"name": name, "betas": [float(b) for b in np.ravel(betas)]}
         if fingerprint:
             head["fingerprint"] = fingerprint
         if offset is not None:

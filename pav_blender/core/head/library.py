@@ -22,25 +22,35 @@ _SECTION = "heads"
 
 
 def load_head(
-    name_or_path: str | Path, fingerprint: str = "", *, flame_version: str = ""
+    name_or_path: str | Path,
+    fingerprint: str = "",
+    *,
+    flame_version: str = "",
+    beside: Path | None = None,
 ) -> HeadModel:
     """The head called "builtin", one remembered by `fingerprint`, or the one in a file.
 
-    A file is a head file of ours, or FLAME's (.pkl, a converted .npz, or a folder that holds one);
-    flame_version says which FLAME where its name does not. Raises InputError where the head is not
-    found, or the one found has another fingerprint.
+    A file is a head file of ours, or FLAME's (.pkl, a converted .npz, or a folder that holds one),
+    named from the folder `beside` (None: from the working folder); flame_version says which FLAME
+    where its name does not. Raises InputError where the head is not found, or the one found has
+    another fingerprint.
     """
-    if str(name_or_path) == BUILTIN:
+    place = Path(name_or_path)
+    if beside is not None and (beside / place).exists():
+        place = beside / place
+    known = preferences.read(_SECTION)
+    own = str(name_or_path) == BUILTIN
+    if own and (fingerprint not in known or fingerprint == builtin_head().fingerprint):
         head = builtin_head()
-    elif fingerprint in (known := preferences.read(_SECTION)):
+    elif fingerprint in known and not (_missing(known[fingerprint]) and place.exists()):
         head = _remembered(name_or_path, known[fingerprint])
-    elif fingerprint and not Path(name_or_path).exists():
+    elif fingerprint and not place.exists():
         raise InputError(
             f"the head {str(name_or_path)!r} (fingerprint {fingerprint[:12]}) is not known on this "
             "machine; name its file once: pav import --head FILE"
         )
     else:
-        head = _read(Path(name_or_path), flame_version)[0]
+        head = _read(place, flame_version)[0]
     if fingerprint and head.fingerprint != fingerprint:
         raise InputError(
             f"the head {str(name_or_path)!r} found here has the fingerprint "
@@ -78,12 +88,8 @@ def _read(path: Path, flame_version: str) -> tuple[HeadModel, dict[str, str]]:
 
 
 def _remembered(name: str | Path, entry: dict) -> HeadModel:
-    entry = {str(k): str(v) for k, v in entry.items()} if isinstance(entry, dict) else {}
-    missing = [
-        path for part, path in entry.items() if part != "version" and not os.path.isfile(path)
-    ]
-    if missing or not ("head" in entry or "model" in entry):
-        gone = missing[0] if missing else "its file"
+    gone = _missing(entry)
+    if gone:
         raise InputError(
             f"the head {str(name)!r}: {gone} is no longer there; name the head's file again: "
             "pav import --head FILE"
@@ -94,6 +100,14 @@ def _remembered(name: str | Path, entry: dict) -> HeadModel:
     parts = {part: Path(path) for part, path in entry.items() if part in known}
     files = FlameFiles(version=entry.get("version", ""), **parts)  # type: ignore[arg-type]
     return _flame(files, _stamps(files))
+
+
+def _missing(entry: object) -> str:
+    """What of a remembered head's files is no longer there, "" if all are."""
+    if not isinstance(entry, dict) or not ("head" in entry or "model" in entry):
+        return "its file"
+    paths = [str(path) for part, path in entry.items() if part != "version"]
+    return next((path for path in paths if not os.path.isfile(path)), "")
 
 
 def _stamps(files: FlameFiles) -> tuple[int, ...]:

@@ -11,7 +11,8 @@ import numpy as np
 
 from ..collection import CollectionWriter
 from ..errors import InputError
-from ..head import HeadModel, load_head
+from ..head import BUILTIN, HeadModel, remember_head
+from ..head.flame import version_of
 from ..progress import Report
 from . import detectors
 from .cache import Cache
@@ -80,7 +81,7 @@ def track(
     if out.exists() and not (overwrite and (out / "collection.json").is_file()):
         raise InputError(f"{out}: exists already; choose another folder or give --overwrite")
     tell = progress or _silent
-    head_model = load_head(head)
+    head_model = remember_head(head)
     sources = [open_source(path) for path in videos]
     names = clip_names([source.path for source in sources])
     looks = appearance_names(names, appearances)
@@ -114,7 +115,11 @@ def track(
     extra = {"tracking": {"clips": reports, "skipped": looked.skipped, "warnings": warnings}}
     start = _OBSERVING + _FITTING
     share = (1 - start) / len(tracks)
-    with CollectionWriter(out, head, fit.betas, extra=extra, overwrite=overwrite) as writer:
+    name = head_model.name if version_of(head_model) else head
+    known = "" if head == BUILTIN else head_model.fingerprint
+    with CollectionWriter(
+        out, name, fit.betas, fingerprint=known, extra=extra, overwrite=overwrite
+    ) as writer:
         for index, done in enumerate(tracks):
             clip = clip_of(head_model, fit.betas, done, size)
             writer.clip(clip)
