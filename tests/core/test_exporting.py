@@ -12,7 +12,6 @@ from pav_blender.cli import main
 from pav_blender.core.collection import Clip
 from pav_blender.core.errors import InputError
 from pav_blender.core.exporting import export_insta, export_meshes, export_vhap
-from pav_blender.core.exporting import vhap as vhap_layout
 from pav_blender.core.images import read_gray, read_rgba
 from pav_blender.core.rendering.cameras import Camera
 
@@ -159,14 +158,6 @@ def test_vhap_parameters_pose_the_head(toy, clips, vhap):
         np.testing.assert_allclose(posed, stored["vertices"], atol=1e-6)
     rest = np.load(folder.parent / "canonical_flame_param.npz", allow_pickle=False)
     np.testing.assert_allclose(rest["jaw_pose"], [[0.3, 0, 0]])
-
-
-def test_a_head_of_flames_size_has_room_for_vhaps_teeth(toy, clips, tmp_path, monkeypatch):
-    monkeypatch.setattr(vhap_layout, "_FLAME_VERTICES", toy.head.vertex_count)
-    export_vhap(toy, clips[:1], tmp_path / "out")
-    folder = tmp_path / "out" / clips[0].name / "flame_param"
-    stored = np.load(folder / "00000.npz", allow_pickle=False)
-    assert stored["static_offset"].shape == (1, 5143, 3)
 
 
 def test_splits_are_kept(clips, insta, vhap):

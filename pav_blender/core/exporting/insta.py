@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..collection import LABELS, Clip, Collection
+from ..collection.importers.labels import INSTA_CODES
 from ..deformation.rigid import head_rotation
 from ..errors import InputError
 from ..files import new_folder, write_text
@@ -20,27 +21,17 @@ from ..progress import Report
 from ..rendering.rasterise import rasterise
 from ..training.frames import camera_of, load_picture
 from ..training.prepare import rigid_weights
-from .layout import copy_picture, padded, pinhole, write_identity, write_transforms
+from .layout import (
+    copy_picture,
+    expressions_of,
+    pinhole,
+    write_head_file,
+    write_names,
+    write_transforms,
+)
 from .meshes import ObjWriter, posed_rows
 
-EXPRESSIONS = 100
 DEPTH_SCALE = 0.001  # metres a step of a depth picture
-
-# what INSTA's face parser calls our labels: left and right, upper and lower are one here
-_PARTS = {
-    "background": 0,
-    "face": 250,
-    "lips": 130,
-    "eyes": 210,
-    "mouth": 140,
-    "ears": 180,
-    "neck": 110,
-    "scalp_hair": 80,
-    "facial_hair": 250,
-    "cloth": 90,
-    "accessory": 190,
-}
-_CODES = np.array([_PARTS[name] for name in LABELS], np.uint8)
 
 # without labels: regions of the mesh, the later over the earlier
 _REGIONS = (
@@ -60,16 +51,18 @@ def export_insta(
 ) -> int:
     """Writes `out`/<clip>/ for each clip as INSTA reads it; returns how many frames.
 
-    images, seg_mask, depth (of the tracked mesh), meshes, flame/exp, canonical.obj, transforms.
+    images, seg_mask, depth (of the tracked mesh), meshes, flame/exp, canonical.obj, transforms;
+    names.json, by which our own importer knows the head again.
     Raises InputError where a clip's lens changes: INSTA has one a clip.
     """
     total, done = sum(len(clip) for clip in clips), 0
     with new_folder(out) as root:
-        write_identity(root, collection)
+        write_head_file(root, collection)
         for clip in clips:
             _check_lens(clip)
             folder = root / clip.name
             folder.mkdir()
+            write_names(folder, collection)
             meshes, frames = ObjWriter(collection.head), []
             canonical = collection.head.canonical(collection.betas)
             meshes.write(folder / "canonical.obj", canonical)
@@ -128,7 +121,7 @@ def _frame(
     rested = vertices.astype(np.float64) @ still[:3, :3].T + still[:3, 3]
     (folder / "meshes").mkdir(exist_ok=True)
     meshes.write(folder / "meshes" / f"{name}.obj", rested)
-    coefficients = padded(clip.expression[row], EXPRESSIONS).tolist()
+    coefficients = expressions_of(head, clip.expression[row]).tolist()
     write_text(
         folder / "flame" / "exp" / f"{name}.txt",
         "".join(f"{value:.8f}\n" for value in coefficients),
@@ -162,15 +155,14 @@ def _parts(
     path = collection.labels_path(clip, row)
     if path.is_file():
         labels = read_gray(path)
-        if labels.shape != alpha.shape or labels.max() >= len(_CODES):
+        if labels.shape != alpha.shape or labels.max() >= len(INSTA_CODES):
             raise InputError(f"{path}: not labels of a {clip.width}x{clip.height} picture")
-        return _CODES[labels]
-    codes = np.full(collection.head.vertex_count, _PARTS["face"], np.uint8)
+        return INSTA_CODES[labels]
+    code = dict(zip(LABELS, INSTA_CODES, strict=True))
+    codes = np.full(collection.head.vertex_count, code["face"], np.uint8)
     for region, part in _REGIONS:
         if region in collection.head.regions:
-            codes[collection.head.regions[region]] = _PARTS[part]
+            codes[collection.head.regions[region]] = code[part]
     # a corner stands for its triangle: these are a few millimetres wide
     seen = codes[collection.head.triangles[triangle, 0]]
-    return np.where(alpha > 127, np.where(triangle >= 0, seen, _PARTS["scalp_hair"]), 0).astype(
-        "u1"
-    )
+    return np.where(alpha > 127, np.where(triangle >= 0, seen, code["scalp_hair"]), 0).astype("u1")

@@ -13,7 +13,8 @@ import numpy as np
 from ..collection import Clip, Collection
 from ..errors import InputError
 from ..files import write_text
-from ..head import write_head
+from ..head import HeadModel, load_head, write_head
+from ..head.flame import EXPRESSIONS, version_of
 
 # ours -> theirs: "val" is their name for cameras that training never saw
 SPLITS = {"train": "train", "test": "test", "view": "val"}
@@ -60,9 +61,33 @@ def copy_picture(collection: Collection, clip: Clip, row: int, target: Path) -> 
     shutil.copyfile(collection.image_path(clip, row), target)
 
 
-def write_identity(folder: Path, collection: Collection) -> None:
-    """`head.npz`: the head itself (regions, weights, bases), so that no peer has to guess it."""
-    write_head(folder / "head.npz", collection.head)
+def write_head_file(folder: Path, collection: Collection) -> None:
+    """`head.npz`: the head itself (regions, weights, bases), so that no peer has to guess it.
+
+    FLAME is not ours to hand on, and its users have it.
+    """
+    if not version_of(collection.head):
+        known = collection.head.fingerprint
+        head = load_head(collection.head_name, known, beside=collection.path)
+        write_head(folder / "head.npz", head)
+
+
+def write_names(folder: Path, collection: Collection) -> None:
+    """`names.json`: the head, its fingerprint, and what its coefficients are called."""
+    head = collection.head
+    names = {
+        "head": head.name,
+        "fingerprint": head.fingerprint,
+        "expressions": head.expression_names,
+    }
+    write_text(folder / "names.json", json.dumps(names, indent=1) + "\n")
+
+
+def expressions_of(head: HeadModel, expression: np.ndarray) -> np.ndarray:
+    """A frame's coefficients [E], padded to the 100 that these layouts have; of FLAME only those
+    that are FLAME's own (what eyelids do is in the meshes)."""
+    own = expression[:EXPRESSIONS] if version_of(head) else expression
+    return padded(own, EXPRESSIONS)
 
 
 def padded(values: np.ndarray, count: int) -> np.ndarray:

@@ -1,29 +1,40 @@
 """VHAP's layout, which GaussianAvatars reads: one folder a clip. The camera rests, the head moves.
 
 A head that is not FLAME's has other coefficients than FLAME: each `flame_param` file also holds
-the posed vertices themselves, in the world of the cameras.
+the posed vertices themselves, in the world of the cameras. FLAME's gets as an offset what its
+coefficients leave out.
 """
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..collection import Clip, Collection
-from ..files import new_folder, replacing, write_text
+from ..collection.importers.rotations import OPENGL
+from ..collection.importers.vhap import TEETH
+from ..files import new_folder, replacing
+from ..head import HeadModel
+from ..head.flame import EXPRESSIONS, EYELIDS, version_of
 from ..images import write_gray
 from ..progress import Report
 from ..training.frames import load_picture
-from .layout import copy_picture, padded, pinhole, write_identity, write_transforms
+from .layout import (
+    copy_picture,
+    expressions_of,
+    padded,
+    pinhole,
+    write_head_file,
+    write_names,
+    write_transforms,
+)
 from .meshes import ObjWriter, posed_rows
+from .offsets import offset_to
 
-SHAPES, EXPRESSIONS = 300, 100
-_FLAME_VERTICES, _WITH_TEETH = 5023, 5143
+SHAPES = 300
 _CANONICAL_JAW = 0.3  # radians
-_TO_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 # theirs: our joints, in order; their rotation is that of the first joint, whatever its name
 _JOINTS = {
     "neck_pose": ("neck",),
@@ -42,12 +53,13 @@ def export_vhap(
     """
     total, done = sum(len(clip) for clip in clips), 0
     with new_folder(out) as root:
-        write_identity(root, collection)
+        write_head_file(root, collection)
         for clip in clips:
             folder = root / clip.name
             folder.mkdir()
             canonical = collection.head.canonical(collection.betas)
             ObjWriter(collection.head).write(folder / "canonical.obj", canonical)
+            write_names(folder, collection)
             _write_rest(collection, folder)
             steps, cameras = _timesteps(clip), _cameras(clip)
             frames: list[dict[str, Any]] = [{} for _ in range(len(clip))]
@@ -96,7 +108,9 @@ def _frame(
     copy_picture(collection, clip, row, folder / "images" / name)
     write_gray(folder / "fg_masks" / name, np.ascontiguousarray(rgba[..., 3]))
     values = _parameters(collection, clip.expression[row], clip.pose[row], clip.translation[row])
-    _write_npz(folder / "flame_param" / f"{step:05d}.npz", {**values, "vertices": vertices[None]})
+    more = _beyond(collection, clip, row, vertices)
+    frame = {**values, **more, "vertices": vertices[None]}
+    _write_npz(folder / "flame_param" / f"{step:05d}.npz", frame)
     return {
         "timestep_index": step,
         "timestep_id": f"{clip.frame_id[row]:05d}",
@@ -105,7 +119,7 @@ def _frame(
         **pinhole(clip, row),
         "h": clip.height,
         "w": clip.width,
-        "transform_matrix": (clip.camera_to_world[row].astype(float) @ _TO_OPENGL).tolist(),
+        "transform_matrix": (clip.camera_to_world[row].astype(float) @ OPENGL).tolist(),
         "file_path": f"images/{name}",
         "fg_mask_path": f"fg_masks/{name}",
         "flame_param_path": f"flame_param/{step:05d}.npz",
@@ -123,19 +137,42 @@ def _parameters(
         for theirs, ours in _JOINTS.items()
     }
     values["rotation"] = pose[None, 0]
-    vertices = head.vertex_count
-    moved = _WITH_TEETH if vertices == _FLAME_VERTICES else vertices
+    offset = collection.head_offset
+    offset = np.zeros_like(head.template) if offset is None else offset
     return {
         "translation": translation[None].astype(np.float32),
         **{key: value.astype(np.float32) for key, value in values.items()},
         "shape": padded(collection.betas, SHAPES),
-        "expr": padded(expression, EXPRESSIONS)[None],
-        "static_offset": np.zeros((1, moved, 3), np.float32),
+        "expr": expressions_of(head, expression)[None],
+        "static_offset": _with_teeth(head, offset)[None],
     }
 
 
+def _beyond(
+    collection: Collection, clip: Clip, row: int, vertices: np.ndarray
+) -> dict[str, np.ndarray]:
+    """What FLAME's coefficients do not say, as peers that run FLAME can take it: `dynamic_offset`;
+    and the eyelids' own coefficients. Other heads' meshes are taken as they are."""
+    head = collection.head
+    if not version_of(head):
+        return {}
+    lids = [head.expression_names.index(name) for name in EYELIDS if name in head.expression_names]
+    values = {"eyelids": clip.expression[row, lids][None]} if lids else {}
+    if clip.vertices is None and not clip.expression[row, EXPRESSIONS:].any():
+        return values
+    moved = clip.expression[row, :EXPRESSIONS], clip.pose[row], clip.translation[row]
+    offset = offset_to(head, collection.betas, *moved, vertices)
+    return values | {"dynamic_offset": _with_teeth(head, offset)[None]}
+
+
+def _with_teeth(head: HeadModel, offset: np.ndarray) -> np.ndarray:
+    """FLAME's offsets [5023, 3] with room for the teeth that VHAP adds; others as they are."""
+    teeth = TEETH if version_of(head) else 0
+    return np.pad(offset, ((0, teeth), (0, 0))).astype(np.float32)
+
+
 def _write_rest(collection: Collection, folder: Path) -> None:
-    """What holds for the whole clip: the pose at rest, and what coefficients are called."""
+    """What holds for the whole clip: the pose at rest."""
     head = collection.head
     pose = np.zeros((len(head.joint_names), 3), np.float32)
     if "jaw" in head.joint_names:
@@ -143,8 +180,6 @@ def _write_rest(collection: Collection, folder: Path) -> None:
     still = np.zeros(len(head.expression_names), np.float32)
     values = _parameters(collection, still, pose, np.zeros(3, np.float32))
     _write_npz(folder / "canonical_flame_param.npz", values)
-    names = {"head": collection.head_name, "expressions": head.expression_names}
-    write_text(folder / "names.json", json.dumps(names, indent=1) + "\n")
 
 
 def _write_npz(path: Path, arrays: dict[str, np.ndarray]) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from ...errors import InputError
 from .labels import PARSING
 from .parsed import POSE_JOINTS, ParsedClip, Picture, stacked
+from .rotations import OPENGL
 from .source import Source, Tell, counted, frames_of, number_in, numbers, rotation_checked
 
 TITLE = "IMavatar"
@@ -86,7 +87,7 @@ def _row(source: Source, key: str, frame: dict, image: Path, what: str) -> dict[
         raise InputError(f"{what}: world_mat is not 3 by 4")
     rotation, place = rotation_checked(world[:, :3], what), world[:, 3] / _SCALE
     to_world = np.eye(4)
-    to_world[:3, :3] = rotation.T @ np.diag([1.0, -1.0, -1.0])  # it looks down -z, y up
+    to_world[:3, :3] = rotation.T @ OPENGL[:3, :3]  # it looks down -z, y up
     to_world[:3, 3] = -rotation.T @ place
     expression = numbers(frame.get("expression"), (-1,), f"{what}: expression")
     pose = numbers(frame.get("pose"), (3 * POSE_JOINTS,), f"{what}: pose")

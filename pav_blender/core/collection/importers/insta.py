@@ -10,11 +10,12 @@ import numpy as np
 from ...errors import InputError
 from .labels import INSTA as LABEL_TABLE
 from .meshes import read_vertices
-from .parsed import ParsedClip, Picture, padded_pose, stacked
+from .parsed import VERTICES, ParsedClip, Picture, padded_pose, stacked
 from .source import (
     Source,
     Tell,
     counted,
+    exported_head,
     first_frame,
     frames_of,
     number_in,
@@ -24,6 +25,7 @@ from .source import (
 )
 
 TITLE = "INSTA"
+_MOST = 10_000  # expressions of any head
 HELD_OUT = 350  # the last frames are the test set where no split is written down
 _FILES = ("transforms.json", "transforms_train.json", "transforms_test.json", "transforms_val.json")
 
@@ -38,13 +40,17 @@ def read(path: Path, name: str, tell: Tell = None) -> list[ParsedClip]:
     """One clip. World: metres, FLAME's axes, the head still; cameras in OpenCV axes."""
     source = Source(path)
     frames, splits, top = _frames(source)
+    head, canonical_path = exported_head(source), source.find("canonical.obj")
+    count = None if head else VERTICES
+    canonical = read_vertices(canonical_path, count) if canonical_path else None
+    if canonical is not None:
+        count = len(canonical)
     rows: list[dict[str, Any]] = []
     skipped: list[str] = []
     for key, frame in counted(frames.items(), tell):
-        row = _row(source, key, frame, top, skipped)
+        row = _row(source, key, frame, top, skipped, count)
         if row:
             rows.append(row | {"split": splits.get(key, "train")})
-    canonical = source.find("canonical.obj")
     width, height = (int(_value(top, {}, key)) for key in ("w", "h"))
     return [
         stacked(
@@ -55,7 +61,8 @@ def read(path: Path, name: str, tell: Tell = None) -> list[ParsedClip]:
             width=width,
             height=height,
             shape=None,
-            canonical=read_vertices(canonical) if canonical else None,
+            canonical=canonical,
+            head=head,
             habit=0 if splits else HELD_OUT,
             skipped=skipped,
             lost=["depth maps", "the meshes' own faces"],
@@ -92,7 +99,12 @@ def _frames(source: Source) -> tuple[dict[str, dict], dict[str, str], dict[str, 
 
 
 def _row(
-    source: Source, key: str, frame: dict, top: dict[str, Any], skipped: list[str]
+    source: Source,
+    key: str,
+    frame: dict,
+    top: dict[str, Any],
+    skipped: list[str],
+    vertices: int | None,
 ) -> dict[str, Any] | None:
     number, what = number_in(key), f"{source.root}: {key}"
     image = source.picture(key)
@@ -113,23 +125,23 @@ def _row(
     return {
         "frame_id": number,
         "picture": Picture(image, None, ((labels, LABEL_TABLE),) if labels else ()),
-        "expression": _expression(expression),
+        "expression": _expression(expression, 100 if vertices == VERTICES else _MOST),
         "pose": padded_pose(),
         "translation": np.zeros(3),
         "intrinsics": np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]),
         "camera_to_world": camera,
-        "vertices": read_vertices(mesh),
+        "vertices": read_vertices(mesh, vertices),
     }
 
 
-def _expression(path: Path) -> np.ndarray:
+def _expression(path: Path, most: int) -> np.ndarray:
     try:
         values = np.array(path.read_bytes().split(), np.float64)
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: not one coefficient a line ({error})") from error
-    if not 0 < len(values) <= 100:
-        raise InputError(f"{path}: {len(values)} coefficients; FLAME has 100")
-    return np.pad(values, (0, 100 - len(values)))
+    if not 0 < len(values) <= most:
+        raise InputError(f"{path}: {len(values)} coefficients; the head has {most} at most")
+    return np.pad(values, (0, max(0, 100 - len(values))))
 
 
 def _value(top: dict[str, Any], frame: dict[str, Any], key: str) -> float:

@@ -47,6 +47,9 @@ def _threshold(below: int, above: int) -> np.ndarray:
 
 
 INSTA = _table(_INSTA)
+# the code that INSTA's parser gives each of LABELS: left and right are one here; a beard is skin
+INSTA_CODES = np.array([_INSTA.get(name, (0,))[0] for name in LABELS], np.uint8)
+INSTA_CODES[LABELS.index("facial_hair")] = _INSTA["face"][0]
 PARSING = _table(_PARSING)
 # FlashAvatar tells head from the rest, and the mouth
 NECK_AND_HEAD = _threshold(LABELS.index("cloth"), LABELS.index("face"))

@@ -1,4 +1,4 @@
-"""The vertices of tracked meshes: OBJ and PLY files of FLAME's 5023 vertices in its order.
+"""The vertices of tracked meshes: OBJ and PLY files of a head's vertices in its own order.
 
 Their faces are not read: INSTA's have 8090 of FLAME's 9976 and leave 958 vertices without one.
 """
@@ -19,8 +19,9 @@ _KINDS = {"float": "f4", "float32": "f4", "double": "f8", "float64": "f8", "ucha
           "uint32": "u4"}  # fmt: skip
 
 
-def read_vertices(path: Path) -> np.ndarray:
-    """[5023, 3] float32, in the file's units; InputError for another mesh or a damaged file."""
+def read_vertices(path: Path, count: int | None = VERTICES) -> np.ndarray:
+    """[count, 3] float32, in the file's units (None: however many there are); InputError for
+    another mesh or a damaged file."""
     try:
         content = path.read_bytes()
         found = _ply(content) if path.suffix == ".ply" else _obj(content)
@@ -33,8 +34,9 @@ def read_vertices(path: Path) -> np.ndarray:
         KeyError,
     ) as error:
         raise InputError(f"{path}: not a readable mesh ({error})") from error
-    if found.shape != (VERTICES, 3):
-        raise InputError(f"{path}: {len(found)} vertices; FLAME has {VERTICES}")
+    if found.shape != (count or len(found), 3):
+        whose = "FLAME" if count == VERTICES else "the head"
+        raise InputError(f"{path}: {len(found)} vertices; {whose} has {count}")
     return found
 
 

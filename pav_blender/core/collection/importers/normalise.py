@@ -17,7 +17,7 @@ from ...images import read_rgba
 from ...progress import Report
 from ..model import Clip
 from ..writer import check_name
-from .parsed import VERTICES, ParsedClip, Picture
+from .parsed import JOINTS, VERTICES, ParsedClip, Picture
 from .registration import canonical_pose, fit_pose, fit_shape
 from .rotations import matrices
 
@@ -75,6 +75,7 @@ def normalise(
         raise InputError(f"--tracked-with {tracked_with!r}: one of {', '.join(VERSIONS)}")
     for clip in parsed:
         check_version(clip, head, tracked_with)
+        _check_counts(clip, head)
     names = [clip.name for clip in parsed]
     for name in names:
         check_name(name, "clip name")
@@ -82,7 +83,7 @@ def normalise(
             raise InputError(f"two clips are called {name!r}; name the sources: NAME=PATH")
     betas = [_own_shape(clip, head) for clip in parsed]
     with_offset = any(clip.offset is not None for clip in parsed)
-    zero = np.zeros((VERTICES, 3))
+    zero = np.zeros(head.template.shape)
     offsets = [zero if clip.offset is None else clip.offset for clip in parsed]
     shared = betas[0] if shapes == "first" else np.mean(betas, 0)
     shared = np.asarray(shared, np.float32)
@@ -100,6 +101,14 @@ def normalise(
 
 def check_version(clip: ParsedClip, head: HeadModel, tracked_with: str = "") -> None:
     """InputError unless the head is the FLAME that the clip's numbers belong to."""
+    if clip.head:
+        if clip.head != head.fingerprint:
+            raise InputError(
+                f"clip {clip.name} was exported with the head of the fingerprint {clip.head[:12]}; "
+                f"{head.name!r} has {head.fingerprint[:12]}: name that head with --head (heads "
+                "other than FLAME lie beside the exported clips: head.npz)"
+            )
+        return
     wanted, found = tracked_with or clip.flame, version_of(head)
     if not found or head.vertex_count != VERTICES:
         raise InputError(
@@ -114,19 +123,28 @@ def check_version(clip: ParsedClip, head: HeadModel, tracked_with: str = "") -> 
         )
 
 
+def _check_counts(clip: ParsedClip, head: HeadModel) -> None:
+    for meshes in (clip.vertices, clip.moving_offset, clip.canonical, clip.offset):
+        if meshes is not None and meshes.shape[-2] != head.vertex_count:
+            raise InputError(
+                f"clip {clip.name}: meshes of {meshes.shape[-2]} vertices; {head.name} has "
+                f"{head.vertex_count}"
+            )
+
+
 def _own_shape(clip: ParsedClip, head: HeadModel) -> np.ndarray:
-    """The clip's betas, float32 [300]; solved from its meshes where its tool wrote none."""
+    """The clip's betas, float32 [B]; solved from its meshes where its tool wrote none."""
     if clip.shape is not None:
-        return np.asarray(clip.shape, np.float32)
+        return np.asarray(clip.shape, np.float32)[: len(head.shape_basis)]
     count = len(head.expression_names)
     if clip.canonical is not None:
-        betas = fit_shape(head, clip.canonical[None], np.zeros((1, count)), canonical_pose())
+        betas = fit_shape(head, clip.canonical[None], np.zeros((1, count)), canonical_pose(head))
         return betas.astype(np.float32)
     if clip.vertices is None:
         raise InputError(f"clip {clip.name}: neither an identity nor meshes")
     rows = np.unique(np.linspace(0, len(clip) - 1, _FIT_FRAMES).round().astype(int))
     expression = _expression(clip, head)[rows]
-    pose = np.zeros((len(rows), 5, 3))
+    pose = np.zeros((len(rows), len(head.joint_names), 3))
     for _ in range(_ROUNDS):
         betas = fit_shape(head, clip.vertices[rows], expression, pose)
         pose, expression = fit_pose(head, betas, expression, clip.vertices[rows])
@@ -136,11 +154,22 @@ def _own_shape(clip: ParsedClip, head: HeadModel) -> np.ndarray:
 def _expression(clip: ParsedClip, head: HeadModel) -> np.ndarray:
     """The clip's expressions in the head's order, eyelids among them, [F, E] float64."""
     values = np.zeros((len(clip), len(head.expression_names)))
-    values[:, : clip.expression.shape[1]] = clip.expression
+    count = min(values.shape[1], clip.expression.shape[1])  # files are padded with zeros
+    values[:, :count] = clip.expression[:, :count]
     if clip.eyelids is not None and EYELIDS[0] in head.expression_names:
         for column, name in enumerate(EYELIDS):
             values[:, head.expression_names.index(name)] = clip.eyelids[:, column]
     return values
+
+
+def _pose(clip: ParsedClip, head: HeadModel) -> np.ndarray:
+    """The clip's turns by the head's own joints, [F, J, 3]."""
+    pose = np.zeros((len(clip), len(head.joint_names), 3))
+    pose[:, 0] = clip.pose[:, 0]
+    for column, name in enumerate(JOINTS[1:], start=1):
+        if name in head.joint_names:
+            pose[:, head.joint_names.index(name)] = clip.pose[:, column]
+    return pose
 
 
 def _normal(
@@ -152,13 +181,13 @@ def _normal(
 ) -> NormalClip:
     notes: list[str] = []
     lost = list(clip.lost)
-    expression, pose = _expression(clip, head), clip.pose.copy()
+    expression, pose = _expression(clip, head), _pose(clip, head)
     head = head.with_offset(offset) if offset.any() else head
     vertices = clip.vertices
     if clip.shape is None and vertices is not None:
         pose, expression = fit_pose(head, betas, expression, vertices)
         notes.append("identity, jaw and eyes were fitted to the meshes")
-    elif vertices is not None:
+    elif vertices is not None and not clip.head:
         pose = _eyes_in_order(head, betas, expression, pose, vertices, notes)
     has_lids = EYELIDS[0] in head.expression_names
     if vertices is None and clip.eyelids is not None and has_lids:

@@ -10,7 +10,8 @@ import numpy as np
 
 from ...errors import InputError
 
-POSE_JOINTS = 5  # root, neck, jaw, left eye, right eye: FLAME's order
+JOINTS = ("root", "neck", "jaw", "left_eye", "right_eye")  # FLAME's order
+POSE_JOINTS = len(JOINTS)
 VERTICES = 5023
 LEAVE = 255  # in a table of labels: keep what an earlier layer said
 
@@ -28,11 +29,12 @@ class Picture:
 class ParsedClip:
     """One clip, F frames. Metres; cameras camera-to-world, OpenCV axes, in the tool's own world.
 
-    flame: the FLAME it was tracked with ("2020", "2023"). shape [B]; expression [F, E]; pose
-    [F, 5, 3] axis-angle; eyelids [F, 2] (left, right) or None; vertices [F, 5023, 3]: the posed
-    mesh where the tool wrote it; canonical [5023, 3]: its neutral head with the jaw open by 12
-    degrees; offset [5023, 3] is added to the template; moving_offset [F, 5023, 3] likewise, a
-    frame. lost: what of the source has no place in a collection; skipped: frames left out, and why.
+    flame: the FLAME it was tracked with ("2020", "2023"); head: the fingerprint of the very head,
+    where `pav export` wrote the source, and then V and E are that head's. shape [B]; expression
+    [F, E]; pose [F, 5, 3] axis-angle; eyelids [F, 2] (left, right) or None; vertices [F, V, 3]: the
+    posed mesh where the tool wrote it; canonical [V, 3]: its neutral head with the jaw open by 12
+    degrees; offset [V, 3] is added to the template; moving_offset [F, V, 3] likewise, a frame.
+    lost: what of the source has no place in a collection; skipped: frames left out, and why.
     """
 
     name: str
@@ -55,6 +57,7 @@ class ParsedClip:
     offset: np.ndarray | None = None
     moving_offset: np.ndarray | None = None
     appearance: str = ""
+    head: str = ""
     habit: int = 0  # frames at the end that the tool's users hold out; where no split is given
     lost: list[str] = field(default_factory=list)
     skipped: list[str] = field(default_factory=list)
@@ -93,10 +96,14 @@ def stacked(name: str, tool: str, rows: list[dict[str, Any]], **rest: Any) -> Pa
         why = f" (for example {skipped[0]})" if skipped else ""
         raise InputError(f"{name}: no frame of this {tool} source can be used{why}")
     used = [kept[number] for number in sorted(kept)]
+    for key in (*_ROW, *_OPTIONAL):
+        if len({np.shape(row.get(key)) for row in used if row.get(key) is not None}) > 1:
+            raise InputError(f"{name}: its frames differ in the size of {key}")
     arrays: dict[str, Any] = {
         key: np.stack([np.asarray(row[key], np.float64) for row in used]) for key in _ROW
     }
-    arrays["expression"] = arrays["expression"][:, :100]
+    if not rest.get("head"):
+        arrays["expression"] = arrays["expression"][:, :100]
     arrays["camera_to_world"][:, 3] = (0, 0, 0, 1)
     for key in _OPTIONAL:
         if all(row.get(key) is not None for row in used):
@@ -120,8 +127,7 @@ def _sensible(values: Any) -> bool:
 
 def padded_pose(**joints: np.ndarray) -> np.ndarray:
     """Axis-angle of named joints -> [5, 3]; the others rest."""
-    names = ("root", "neck", "jaw", "left_eye", "right_eye")
     pose = np.zeros((POSE_JOINTS, 3))
     for joint, turn in joints.items():
-        pose[names.index(joint)] = turn
+        pose[JOINTS.index(joint)] = turn
     return pose

@@ -12,18 +12,23 @@ from ...head.flame import EYELIDS
 from ...head.model import CANONICAL_JAW_DEGREES
 from ...head.skinning import joint_motions, pose_vertices, rotation_matrices
 
-JAW, EYES = 2, (3, 4)
+_TURNING = ("jaw", "left_eye", "right_eye")  # the joints that are looked for
 _STEPS = 6
 _DIFFERENCE = 1e-5
 _CHUNK = 256
 _SAMPLES = 150  # vertices a part
 
 
-def canonical_pose() -> np.ndarray:
-    """The jaw open by 12 degrees: [1, 5, 3]."""
-    pose = np.zeros((1, 5, 3))
-    pose[0, JAW, 0] = math.radians(CANONICAL_JAW_DEGREES)
+def canonical_pose(head: HeadModel) -> np.ndarray:
+    """The jaw, if there is one, open by 12 degrees: [1, J, 3]."""
+    pose = np.zeros((1, len(head.joint_names), 3))
+    if "jaw" in head.joint_names:
+        pose[0, head.joint_names.index("jaw"), 0] = math.radians(CANONICAL_JAW_DEGREES)
     return pose
+
+
+def _turning(head: HeadModel) -> list[int]:
+    return [head.joint_names.index(name) for name in _TURNING if name in head.joint_names]
 
 
 def fit_shape(
@@ -65,25 +70,28 @@ def fit_pose(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Jaw and eyes (and eyelids, where the head has them) of meshes [F, V, 3] of a still head.
 
-    expression [F, E]. Returns pose [F, 5, 3] and expression [F, E] with the eyelids filled in.
+    expression [F, E]. Returns pose [F, J, 3] and expression [F, E] with the eyelids filled in.
     By Gauss-Newton on some hundreds of vertices.
     """
     lids = [head.expression_names.index(n) for n in EYELIDS if n in head.expression_names]
+    turning = _turning(head)
     chosen = _chosen(head, lids)
-    small = _reduced(head, betas, chosen)
     pose = np.zeros((len(vertices), len(head.joint_names), 3))
     filled = np.array(expression, np.float64)
+    if not (turning or lids):
+        return pose, filled
+    small = _reduced(head, betas, chosen)
     for start in range(0, len(vertices), _CHUNK):
         part = slice(start, start + _CHUNK)
         pose[part], filled[part] = _fit_chunk(
-            small, filled[part], vertices[part][:, chosen].astype(np.float64), lids
+            small, filled[part], vertices[part][:, chosen].astype(np.float64), lids, turning
         )
     return pose, filled
 
 
 def _chosen(head: HeadModel, lids: list[int]) -> np.ndarray:
     weights = head.skinning_weights
-    parts = [np.flatnonzero(weights[:, joint] > 0.3) for joint in (JAW, *EYES)]
+    parts = [np.flatnonzero(weights[:, joint] > 0.3) for joint in _turning(head)]
     parts += [np.flatnonzero(np.abs(head.expression_basis[lid]).max(1) > 1e-3) for lid in lids]
     spread = [part[:: max(1, -(-len(part) // _SAMPLES))] for part in parts]
     return np.unique(np.concatenate(spread)) if any(len(p) for p in parts) else np.arange(50)
@@ -122,10 +130,11 @@ def _reduced(head: HeadModel, betas: np.ndarray, chosen: np.ndarray) -> dict:
 
 
 def _fit_chunk(
-    small: dict, expression: np.ndarray, goals: np.ndarray, lids: list[int]
+    small: dict, expression: np.ndarray, goals: np.ndarray, lids: list[int], turning: list[int]
 ) -> tuple[np.ndarray, np.ndarray]:
     frames, joints = len(goals), len(small["joint_parents"])
-    unknowns = 9 + len(lids)
+    turns = 3 * len(turning)
+    unknowns = turns + len(lids)
     values = np.zeros((frames, unknowns))
     basis = small["expression_basis"]
     base = torch.tensor(expression)
@@ -139,8 +148,8 @@ def _fit_chunk(
 
     def posed(at: np.ndarray) -> torch.Tensor:
         pose = torch.zeros(frames, joints, 3, dtype=torch.float64)
-        pose[:, [JAW, *EYES]] = torch.tensor(at[:, :9].reshape(frames, 3, 3))
-        lid = torch.tensor(at[:, 9:])
+        pose[:, turning] = torch.tensor(at[:, :turns].reshape(frames, -1, 3))
+        lid = torch.tensor(at[:, turns:])
         still = torch.zeros(frames, 3, dtype=torch.float64)
         empty = torch.zeros(0, dtype=torch.float64)
         made = pose_vertices({**rest, "template": shaped}, empty, lid, pose, still)
@@ -160,7 +169,7 @@ def _fit_chunk(
         step = torch.linalg.solve(normal, (jacobian @ left[..., None])[..., 0])
         values += step.numpy()
     pose = np.zeros((frames, joints, 3))
-    pose[:, [JAW, *EYES]] = values[:, :9].reshape(frames, 3, 3)
+    pose[:, turning] = values[:, :turns].reshape(frames, -1, 3)
     filled = expression.copy()
-    filled[:, lids] = values[:, 9:]
+    filled[:, lids] = values[:, turns:]
     return pose, filled

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # between cameras of OpenCV's axes and OpenGL's
+
 
 def matrix_of_6d(six: np.ndarray) -> np.ndarray:
     """[..., 6] -> [..., 3, 3]: the first two ROWS, made orthonormal (as PyTorch3D does)."""

@@ -99,6 +99,14 @@ def peek_json(path: Path) -> dict[str, Any]:
         return {}
 
 
+def exported_head(source: Source) -> str:
+    """The fingerprint of the head that `pav export` wrote the source with; "" of other tools'."""
+    if not source.find("names.json"):
+        return ""
+    found = peek_json(source.root / "names.json").get("fingerprint")
+    return found if isinstance(found, str) and re.fullmatch(r"[0-9a-f]{64}", found) else ""
+
+
 def frames_of(content: dict[str, Any], path: Path) -> list[dict[str, Any]]:
     frames = content.get("frames")
     if not isinstance(frames, list) or not all(isinstance(f, dict) for f in frames):

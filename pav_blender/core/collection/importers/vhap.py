@@ -14,12 +14,15 @@ import numpy as np
 
 from ...errors import InputError
 from .parsed import POSE_JOINTS, VERTICES, ParsedClip, Picture, stacked
+from .rotations import OPENGL
 from .source import (
     Source,
     Tell,
     counted,
+    exported_head,
     first_frame,
     frames_of,
+    number_in,
     numbers,
     peek_json,
     rotation_checked,
@@ -27,8 +30,8 @@ from .source import (
 
 TITLE = "VHAP"
 TEETH = 120
+_MOST = 10_000  # coefficients of any head
 _FILES = ("transforms.json", "transforms_train.json", "transforms_val.json", "transforms_test.json")
-_GL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def looks_like(path: Path) -> bool:
@@ -88,6 +91,7 @@ class _Parameters:
 
     def __init__(self, source: Source) -> None:
         self.lost: set[str] = set()
+        self.head = exported_head(source)
         self._source = source
         self._rows: dict[str, dict[str, np.ndarray]] = {}
         self._offsets: dict[str, np.ndarray | None] = {}
@@ -95,7 +99,10 @@ class _Parameters:
     def row(self, name: str) -> dict[str, np.ndarray]:
         if name not in self._rows:
             what = f"{self._source.root}: {name}"
-            row = flame_parameters(self._source.arrays(name), what, self.lost)
+            content = self._source.arrays(name)
+            row = flame_parameters(content, what, self.lost, any_head=bool(self.head))
+            if self.head:
+                row |= _of_ours(content, what)
             self._offsets.setdefault(name.rpartition("/")[0], row.pop("offset", None))
             self._rows[name] = row
         return self._rows[name]
@@ -132,7 +139,7 @@ def _read(
         rows.append(
             row
             | {
-                "frame_id": _number(key, frame),
+                "frame_id": _number(key, frame, ours=bool(cache.head)),
                 "picture": Picture(image, matte),
                 "split": splits.get(key, "train"),
                 "intrinsics": intrinsics,
@@ -151,15 +158,27 @@ def _read(
         height=size[1],
         shape=np.mean(shapes, 0),
         offset=cache.offset(parameters),
+        head=cache.head,
         skipped=skipped,
         lost=sorted(cache.lost),
     )
 
 
+def _of_ours(content: dict[str, np.ndarray], what: str) -> dict[str, np.ndarray]:
+    """What `pav export` adds to a frame: the posed mesh, and eyelids that FLAME's files lack."""
+    row = {"vertices": numbers(content.get("vertices"), (1, -1, 3), f"{what}: vertices")[0]}
+    if "eyelids" in content:
+        row["eyelids"] = numbers(content["eyelids"], (1, 2), f"{what}: eyelids")[0]
+    return row
+
+
 def flame_parameters(
-    content: dict[str, np.ndarray], what: str, lost: set[str]
+    content: dict[str, np.ndarray], what: str, lost: set[str], *, any_head: bool = False
 ) -> dict[str, np.ndarray]:
-    """A frame's npz as a row: shape, expression, pose, translation, offsets without the teeth."""
+    """A frame's npz as a row: shape, expression, pose, translation, offsets without the teeth.
+
+    any_head: it may have other counts than FLAME has.
+    """
     sizes = {"translation": 3, "rotation": 3, "neck_pose": 3, "jaw_pose": 3, "eyes_pose": 6}
     values = {}
     for key, count in sizes.items():
@@ -170,14 +189,14 @@ def flame_parameters(
         raise InputError(f"{what}: shape or expr is missing")
     shape = numbers(np.ravel(content["shape"]), (-1,), f"{what}: shape")
     expression = numbers(np.ravel(content["expr"]), (-1,), f"{what}: expr")
-    if len(shape) > 300 or len(expression) > 100:
+    if max(len(shape) - 300, len(expression) - 100) > (_MOST if any_head else 0):
         raise InputError(f"{what}: {len(shape)} shapes, {len(expression)} expressions; not FLAME")
     pose = np.concatenate(
         [values[k] for k in ("rotation", "neck_pose", "jaw_pose", "eyes_pose")]
     ).reshape(POSE_JOINTS, 3)
     row = {
-        "shape": np.pad(shape, (0, 300 - len(shape))),
-        "expression": np.pad(expression, (0, 100 - len(expression))),
+        "shape": np.pad(shape, (0, max(0, 300 - len(shape)))),
+        "expression": np.pad(expression, (0, max(0, 100 - len(expression)))),
         "pose": pose,
         "translation": values["translation"],
     }
@@ -186,22 +205,16 @@ def flame_parameters(
             continue
         offset = np.asarray(content[key])
         offset = offset[0] if offset.ndim == 3 and len(offset) == 1 else offset
-        if (
-            offset.ndim != 2
-            or offset.shape[1:] != (3,)
-            or len(offset)
-            not in (
-                VERTICES,
-                VERTICES + TEETH,
-            )
-        ):
+        fits = offset.ndim == 2 and offset.shape[1:] == (3,)
+        if not fits or not (any_head or len(offset) in (VERTICES, VERTICES + TEETH)):
             raise InputError(
                 f"{what}: {key} has shape {list(offset.shape)}; {VERTICES} vertices or "
                 f"{VERTICES + TEETH} with teeth are needed"
             )
-        if len(offset) > VERTICES:
+        if len(offset) == VERTICES + TEETH:
+            offset = offset[:VERTICES]
             lost.add(f"the {TEETH} vertices of VHAP's own teeth")
-        row[ours] = offset[:VERTICES].astype(np.float32)
+        row[ours] = offset.astype(np.float32)
     if "offset" in row and not np.isfinite(row["offset"]).all():
         raise InputError(f"{what}: static_offset is not finite")
     if not np.isfinite(row["shape"]).all():
@@ -210,7 +223,7 @@ def flame_parameters(
 
 
 def _camera(frame: dict, what: str) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
-    to_world = numbers(frame.get("transform_matrix"), (4, 4), what) @ _GL
+    to_world = numbers(frame.get("transform_matrix"), (4, 4), what) @ OPENGL
     rotation_checked(to_world[:3, :3], what)
     keys = ("fl_x", "fl_y", "cx", "cy", "w", "h")
     fx, fy, cx, cy, width, height = (
@@ -222,8 +235,12 @@ def _camera(frame: dict, what: str) -> tuple[np.ndarray, np.ndarray, tuple[int, 
     return to_world, intrinsics, (int(width), int(height))
 
 
-def _number(key: str, frame: dict) -> int:
-    """The time step in a picture's name TTTTT_CC, which restarts with each sequence."""
+def _number(key: str, frame: dict, *, ours: bool) -> int:
+    """The time step in a picture's name TTTTT_CC, which restarts with each sequence; in what we
+    exported the frame's own number."""
+    own = number_in(str(frame.get("timestep_id", ""))) if ours else None
+    if own is not None:
+        return own
     match = re.search(r"(\d{1,9})_(\d+)\.\w+$", key)
     step = int(match[1]) if match else frame.get("timestep_index")
     if not isinstance(step, int) or not 0 <= step < 10**9:

@@ -10,6 +10,7 @@ import numpy as np
 
 from ...errors import InputError
 from .parsed import ParsedClip, Picture, stacked
+from .rotations import OPENGL
 from .source import Source, Tell, counted, number_in, numbers
 from .vhap import flame_parameters
 
@@ -44,7 +45,7 @@ def read(path: Path, name: str, tell: Tell = None) -> list[ParsedClip]:
     if not 0 < focal < 1e4:
         raise InputError(f"{file}: focal_length is {focal}")
     focal *= max(height, width)
-    to_world = np.diag([1.0, -1.0, -1.0, 1.0])
+    to_world = OPENGL.copy()
     to_world[2, 3] = 1.0  # VHAP's camera stands a metre before the origin and looks down -z
     rows: list[dict[str, Any]] = []
     skipped: list[str] = []

@@ -78,9 +78,10 @@ def cut_out(picture: Picture, size: tuple[int, int]) -> np.ndarray:
     if picture.matte is not None:
         matte = _gray8(picture.matte)
         _check_size(picture.matte, matte, size)
-        alpha = rgba[..., 3].astype(np.uint16) * matte
-        rgba[..., 3] = (alpha + 127) // 255
-        rgba[..., :3] = without_background(rgba[..., :3], rgba[..., 3])
+        cut_already = bool((rgba[..., 3] < 255).any())
+        rgba[..., 3] = np.minimum(rgba[..., 3], matte)  # often the one is a copy of the other
+        if not cut_already:
+            rgba[..., :3] = without_background(rgba[..., :3], rgba[..., 3])
     return rgba
 
 
