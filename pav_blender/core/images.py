@@ -13,6 +13,9 @@ from .errors import InputError
 from .files import replacing
 
 
+_NONE, _AVERAGE = 8, 64  # libpng's names for a row's filter
+
+
 def _oiio() -> ModuleType:
     try:
         return importlib.import_module("OpenImageIO")
@@ -151,6 +154,8 @@ def _write(
     spec = oiio.ImageSpec(width, height, channels, kind)
     spec.attribute("oiio:UnassociatedAlpha", 1)
     spec.attribute("png:compressionLevel", 4)
+    # one filter for all rows: as small as the best for each, in two thirds of the time
+    spec.attribute("png:filter", _AVERAGE if channels > 1 else _NONE)
     _save(path, spec, pixels, metadata)
 
 

@@ -20,12 +20,13 @@ import numpy as np
 from scipy import sparse
 from scipy.spatial import cKDTree
 
-from pav_blender.core.head import builtin_head
+from pav_blender.core.head import HeadModel, builtin_head
 from pav_blender.core.rendering.cameras import Camera
 from pav_blender.core.rendering.rasterise import rasterise
 
 VERTICES = 5023
 SIZE = (80, 96)  # height, width
+SOFTER = 0.3  # its expressions are so much of the built-in head's
 
 
 @dataclass
@@ -37,6 +38,8 @@ class Flame:
     uv_faces: np.ndarray
     masks: dict[str, np.ndarray]
     eyelids: tuple[np.ndarray, np.ndarray]
+    kept: np.ndarray  # the built-in head's vertex that each vertex is
+    order: np.ndarray  # the built-in head's expression that each of the first 52 is
 
 
 @lru_cache(maxsize=2)
@@ -55,24 +58,20 @@ def flame(seed: int = 0) -> Flame:
     whole = (new[head.triangles] >= 0).all(1)
     faces = new[head.triangles[whole]].astype(np.uint32)
     template = head.template[kept].astype(np.float64)
-    joints = head.joints(np.zeros(4))
-    regressor = np.zeros((5, VERTICES))
-    for joint, place in enumerate(joints):
-        near = cKDTree(template).query(place, k=40)[1]
-        regressor[joint, near] = 1 / 40
     shapes = np.zeros((300, VERTICES, 3))
     shapes[:64] = head.shape_basis[:, kept]
     mix = random.normal(0, 0.2, (236, 64)) / np.arange(1, 237)[:, None] ** 0.5
     shapes[64:] = np.tensordot(mix, shapes[:64], 1) + 2e-4 * waves(template, 236, random)
     expressions = np.zeros((100, VERTICES, 3))
-    expressions[:52] = 0.3 * head.expression_basis[random.permutation(52)][:, kept]
+    order = random.permutation(52)
+    expressions[:52] = SOFTER * head.expression_basis[order][:, kept]
     expressions[52:] = np.tensordot(random.normal(0, 0.2, (48, 52)), expressions[:52], 1)
     expressions[52:] += 2e-4 * waves(template, 48, random)
     arrays = {
         "v_template": template,
         "shapedirs": np.moveaxis(np.concatenate([shapes, expressions]), 0, 2).copy(),
         "posedirs": np.moveaxis(5e-4 * waves(template, 36, random), 0, 2).copy(),
-        "J_regressor": regressor,
+        "J_regressor": (regressor := joint_regressor(head, kept)),
         "kintree_table": np.array([[2**32 - 1, 0, 1, 1, 1], [0, 1, 2, 3, 4]], np.uint32),
         "weights": head.skinning_weights[kept].astype(np.float64),
         "f": faces,
@@ -88,7 +87,29 @@ def flame(seed: int = 0) -> Flame:
         head.expression_basis[keys.index(k)][kept].astype(np.float64)
         for k in ("eyeBlinkLeft", "eyeBlinkRight")
     ]
-    return Flame(arrays, head.uvs, head.uv_triangles[whole], masks, (lids[0], lids[1]))
+    return Flame(arrays, head.uvs, head.uv_triangles[whole], masks, (lids[0], lids[1]), kept, order)
+
+
+def joint_regressor(head: HeadModel, kept: np.ndarray) -> np.ndarray:
+    """[5, V]: reads the built-in head's joints off vertices near them, whatever its identity; its
+    expressions move none."""
+    template = head.template[kept].astype(np.float64)
+    rows = np.zeros((5, len(kept)))
+    for joint, place in enumerate(head.joints(np.zeros(4))):
+        near = cKDTree(template).query(place, k=900)[1]
+        bases = np.concatenate(
+            [head.template[None], head.shape_basis, head.expression_basis]
+        ).astype(np.float64)
+        moves = head.joint_regressor[joint] @ bases
+        moves[1 + len(head.shape_basis) :] = 0
+        columns = np.moveaxis(bases[:, kept[near]], 1, 2).reshape(-1, len(near))
+        columns = np.concatenate([np.ones((1, len(near))), columns])
+        wanted = np.concatenate([[1], moves.ravel()])
+        start = np.full(len(near), 1 / len(near))
+        rows[joint, near] = (
+            start + np.linalg.lstsq(columns, wanted - columns @ start, rcond=None)[0]
+        )
+    return rows
 
 
 def waves(points: np.ndarray, count: int, random: np.random.Generator) -> np.ndarray:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import pickle
 import zipfile
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,6 @@ from flame_fixture import (
     SIZE,
     VERTICES,
     flame,
-    picture,
     posed,
     project_cv,
     project_gl,
@@ -21,82 +20,16 @@ from flame_fixture import (
     write_companions,
     write_model,
 )
+from scipy.spatial.transform import Rotation
+from takes import FRAMES, Take, looking_cv, sixes, take
 
+from pav_blender.core.collection import LABELS
 from pav_blender.core.head.oracle import rotation_matrix
 from pav_blender.core.images import write_gray, write_rgba
 
-FOCAL = 190.0
-CENTRE = (50.25, 38.5)
-FRAMES = 6
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
-__all__ = ["flame", "posed", "write_companions", "write_model"]
-
-
-# ---- a performance
-
-
-@dataclass
-class Take:
-    """What happens in a clip; truth[frame number] = pixels [V, 2] as the tool projects them."""
-
-    shape: np.ndarray
-    expression: np.ndarray  # [F, 100]
-    root: np.ndarray  # [F, 3]
-    neck: np.ndarray
-    jaw: np.ndarray
-    eyes: np.ndarray  # [F, 2, 3]
-    lids: np.ndarray  # [F, 2]
-    truth: dict[int, np.ndarray] = field(default_factory=dict)
-
-    def turns(self, frame: int, *, root: bool = True, neck: bool = True) -> np.ndarray:
-        still = np.zeros(3)
-        return np.stack(
-            [
-                rotation_matrix(self.root[frame] if root else still),
-                rotation_matrix(self.neck[frame] if neck else still),
-                rotation_matrix(self.jaw[frame]),
-                rotation_matrix(self.eyes[frame, 0]),
-                rotation_matrix(self.eyes[frame, 1]),
-            ]
-        )
-
-
-def take(seed: int = 0, frames: int = FRAMES) -> Take:
-    random = np.random.default_rng(seed)
-    shape = np.zeros(300)
-    shape[:80] = random.normal(0, 0.5, 80)
-    expression = np.zeros((frames, 100))
-    expression[:, :40] = random.normal(0, 0.5, (frames, 40))
-    turn = np.linspace(-0.4, 0.4, frames)
-    zero = np.zeros(frames)
-    return Take(
-        shape,
-        expression,
-        root=np.stack([0.2 * turn, turn, 0.3 * turn], 1),
-        neck=np.stack([0.1 * np.cos(5 * turn), 0.2 * turn, zero], 1),
-        jaw=np.stack([random.uniform(0, 0.3, frames), 0.03 * turn, zero], 1),
-        eyes=random.uniform(-0.25, 0.25, (frames, 2, 3)),
-        lids=random.uniform(0, 0.8, (frames, 2)),
-    )
-
-
-def sixes(matrix: np.ndarray) -> np.ndarray:
-    """A rotation's first two rows: PyTorch3D's six numbers."""
-    return matrix[:2].ravel()
-
-
-def looking_cv(root: np.ndarray, distance: float = 0.75) -> np.ndarray:
-    """World to camera, OpenCV: before a face at the origin's height, turned against the head."""
-    centre = np.array([0.0, -0.02, 0.03])
-    turn = np.diag([1.0, -1.0, -1.0]) @ rotation_matrix(root)
-    matrix = np.eye(4)
-    matrix[:3, :3] = turn
-    matrix[:3, 3] = -turn @ centre + [0.01, 0.0, distance]
-    return matrix
-
-
-def lens() -> tuple[float, float, float, float]:
-    return (FOCAL, FOCAL * 1.01, *CENTRE)
+__all__ = ["FRAMES", "flame", "posed", "write_companions", "write_model"]
 
 
 def save_frame(path: Path, content: dict) -> None:
@@ -141,9 +74,9 @@ CANONICAL_TURNS = np.stack(
 def metrical_frame(act: Take, frame: int) -> tuple[dict, np.ndarray, np.ndarray]:
     """A checkpoint's content, the posed mesh, world to camera."""
     turns = act.turns(frame, root=False, neck=False)
-    world = looking_cv(act.root[frame])
+    world = act.filmed.resting[frame] if act.filmed else looking_cv(act.root[frame])
     vertices = posed(act.shape, act.expression[frame], turns) + lid_offset(act.lids[frame])
-    fx, fy, cx, cy = lens()
+    fx, fy, cx, cy = act.lens
     f4 = np.float32
     content = {
         "flame": {
@@ -166,7 +99,7 @@ def metrical_frame(act: Take, frame: int) -> tuple[dict, np.ndarray, np.ndarray]
             "t": world[None, :3, 3].astype(f4),
             "K": np.array([[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]], f4),
         },
-        "img_size": np.array(SIZE),
+        "img_size": np.array(act.size),
         "frame_id": f"{frame:05d}",
         "global_step": 40,
     }
@@ -174,18 +107,25 @@ def metrical_frame(act: Take, frame: int) -> tuple[dict, np.ndarray, np.ndarray]
 
 
 def write_metrical(
-    path: Path, *, seed: int = 0, meshes: bool = True, matte: bool = False, frames: int = FRAMES
+    path: Path,
+    *,
+    seed: int = 0,
+    meshes: bool = True,
+    matte: bool = False,
+    frames: int = FRAMES,
+    act: Take | None = None,
 ) -> Take:
     """matte: a folder of a user's own beside it, for the tracker writes none."""
-    act = take(seed, frames)
+    act = act or take(seed, frames)
+    frames = len(act)
     for folder in ("checkpoint", "input", "mesh", "depth", *(["matte"] if matte else [])):
         (path / folder).mkdir(parents=True)
     for frame in range(frames):
         content, vertices, world = metrical_frame(act, frame)
         save_frame(path / f"checkpoint/{frame:05d}.frame", content)
-        pixels, depth = project_cv(vertices, world, lens())
+        pixels, depth = project_cv(vertices, world, act.lens)
         act.truth[frame] = pixels
-        rgba = picture(pixels, depth)
+        rgba = act.picture(frame, pixels, depth)
         write_rgba(path / f"input/{frame:05d}.png", _opaque(rgba, 70))
         if matte:
             write_gray(path / f"matte/{frame:05d}.png", rgba[..., 3])
@@ -194,47 +134,67 @@ def write_metrical(
     return act
 
 
-def write_flashavatar(path: Path, *, seed: int = 0, frames: int = FRAMES) -> Take:
+def write_flashavatar(
+    path: Path,
+    *,
+    seed: int = 0,
+    frames: int = FRAMES,
+    act: Take | None = None,
+) -> Take:
     """Its pictures are numbered from 1, the checkpoints from 0."""
-    act = take(seed, frames)
+    act = act or take(seed, frames)
+    frames = len(act)
     for folder in ("checkpoint", "imgs", "alpha", "parsing"):
         (path / folder).mkdir(parents=True)
     act.truth = {}
     for frame in range(frames):
         content, vertices, world = metrical_frame(act, frame)
         save_frame(path / f"checkpoint/{frame:05d}.frame", content)
-        pixels, depth = project_cv(vertices, world, lens())
+        pixels, depth = project_cv(vertices, world, act.lens)
         act.truth[frame] = pixels
-        rgba = picture(pixels, depth)
+        rgba = act.picture(frame, pixels, depth)
         write_rgba(path / f"imgs/{frame + 1:05d}.png", _opaque(rgba, 90))
         write_gray(path / f"alpha/{frame + 1:05d}.png", rgba[..., 3])
         inside = (rgba[..., 3] > 127).astype(np.uint8) * 255
+        mouth = np.zeros_like(inside)
+        if act.filmed:
+            inside = _coded(act.labels(frame), dict.fromkeys(PARSING_CODES, 255) | {"cloth": 0})
+            mouth = _coded(act.labels(frame), {"mouth": 255})
         write_gray(path / f"parsing/{frame + 1:05d}_neckhead.png", inside)
-        write_gray(path / f"parsing/{frame + 1:05d}_mouth.png", np.zeros_like(inside))
+        write_gray(path / f"parsing/{frame + 1:05d}_mouth.png", mouth)
     return act
 
 
 def write_insta(
-    path: Path, *, seed: int = 0, split: bool = True, frames: int = FRAMES, canonical: bool = True
+    path: Path,
+    *,
+    seed: int = 0,
+    split: bool = True,
+    frames: int = FRAMES,
+    act: Take | None = None,
+    canonical: bool = True,
 ) -> Take:
-    act = take(seed, frames)
+    act = act or take(seed, frames)
+    frames = len(act)
     for folder in ("images", "seg_mask", "meshes", "flame/exp"):
         (path / folder).mkdir(parents=True)
-    fx, fy, cx, cy = lens()
-    height, width = SIZE
+    fx, fy, cx, cy = act.lens
+    height, width = act.size
     top = {"w": float(width), "h": float(height), "cx": cx, "cy": cy, "fl_x": fx, "fl_y": fy}
     top |= {"camera_angle_x": 2 * np.arctan(width / fx / 2), "integer_depth_scale": 0.001}
     entries = []
     for frame in range(frames):
         _, vertices, world = metrical_frame(act, frame)
-        pixels, depth = project_cv(vertices, world, lens())
+        pixels, depth = project_cv(vertices, world, act.lens)
         act.truth[frame] = pixels
         name = f"{frame:05d}"
-        rgba = picture(pixels, depth)
+        rgba = act.picture(frame, pixels, depth)
         write_rgba(path / f"images/{name}.png", rgba)
-        mask = np.zeros((*SIZE, 4), np.uint8)
+        mask = np.zeros((*act.size, 4), np.uint8)
         mask[..., 0] = np.where(rgba[..., 3] > 127, 250, 0)
         mask[: height // 3, :, 0] = np.where(rgba[: height // 3, :, 3] > 127, 80, 0)
+        if act.filmed:
+            mask[..., 0] = _coded(act.labels(frame), INSTA_CODES)
         mask[..., 3] = 255
         write_rgba(path / f"seg_mask/{name}.png", mask)
         (path / f"meshes/{name}.obj").write_text(obj_text(vertices))
@@ -257,8 +217,8 @@ def write_insta(
     shuffled = [entries[i] for i in np.random.default_rng(3).permutation(frames)]
     write_json(path / "transforms.json", top | {"frames": shuffled})
     if split:
-        write_json(path / "transforms_train.json", top | {"frames": entries[:-2]})
-        write_json(path / "transforms_test.json", top | {"frames": entries[-2:]})
+        write_json(path / "transforms_train.json", top | {"frames": entries[: -act.held]})
+        write_json(path / "transforms_test.json", top | {"frames": entries[-act.held :]})
         write_json(path / "transforms_val.json", top | {"frames": entries[-1:]})
     return act
 
@@ -278,6 +238,8 @@ def vhap_offsets(frame: int) -> tuple[np.ndarray, np.ndarray]:
 def vhap_rows(act: Take, frame: int, dynamic: bool) -> tuple[dict, np.ndarray]:
     static, moving = vhap_offsets(frame)
     translation = np.array([0.02, 0.01 * frame, -0.05])
+    if act.filmed:
+        static, moving, translation = 0 * static, 0 * moving, act.filmed.translation[frame]
     offset = static + moving if dynamic else static
     vertices = posed(
         act.shape, act.expression[frame], act.turns(frame), translation, offset[:VERTICES]
@@ -297,6 +259,21 @@ def vhap_rows(act: Take, frame: int, dynamic: bool) -> tuple[dict, np.ndarray]:
     return {k: v.astype(np.float32) for k, v in content.items()}, vertices
 
 
+def before_camera(act: Take, frame: int, world_to_camera: np.ndarray) -> tuple[dict, np.ndarray]:
+    """A filmed frame's parameters for a camera that rests there: the head moves instead."""
+    assert act.filmed
+    move = np.linalg.inv(world_to_camera) @ act.filmed.world_to_camera[frame]
+    model, shaping = flame().arrays, np.concatenate([act.shape, act.expression[frame]])
+    root = model["J_regressor"][0] @ (model["v_template"] + model["shapedirs"] @ shaping)
+    turned = dataclasses.replace(act, root=act.root.copy())
+    turned.root[frame] = Rotation.from_matrix(
+        move[:3, :3] @ rotation_matrix(act.root[frame])
+    ).as_rotvec()
+    shift = move[:3, :3] @ (root + act.filmed.translation[frame]) + move[:3, 3] - root
+    turned.filmed = dataclasses.replace(act.filmed, translation=np.tile(shift, (len(act), 1)))
+    return vhap_rows(turned, frame, dynamic=False)
+
+
 def vhap_camera(camera: int) -> np.ndarray:
     """Camera to world, OpenGL: a metre off, others to the side."""
     matrix = np.eye(4)
@@ -313,21 +290,25 @@ def write_vhap(
     dynamic: bool = False,
     split: bool = True,
     frames: int = FRAMES,
+    act: Take | None = None,
 ) -> Take:
-    act = take(seed, frames)
+    act = act or take(seed, frames)
+    frames = len(act)
     for folder in ("images", "fg_masks", "flame_param"):
         (path / folder).mkdir(parents=True)
-    fx, fy, cx, cy = lens()
+    fx, fy, cx, cy = act.lens
     entries = []
     for frame in range(frames):
         content, vertices = vhap_rows(act, frame, dynamic)
         np.savez(path / f"flame_param/{frame:05d}.npz", **content)
         for camera in range(cameras):
             to_world = vhap_camera(camera)
-            pixels, depth = project_gl(vertices, np.linalg.inv(to_world), lens())
+            if act.filmed:
+                to_world = np.linalg.inv(act.filmed.world_to_camera[frame]) @ OPENGL
+            pixels, depth = project_gl(vertices, np.linalg.inv(to_world), act.lens)
             act.truth[1000 * camera + frame] = pixels
             name = f"{frame:05d}_{camera:02d}.png"
-            rgba = picture(pixels, depth)
+            rgba = act.picture(frame, pixels, depth)
             write_rgba(path / f"images/{name}", _opaque(rgba, 255))
             write_gray(path / f"fg_masks/{name}", rgba[..., 3])
             entries.append(
@@ -341,8 +322,8 @@ def write_vhap(
                     "cy": cy,
                     "fl_x": fx,
                     "fl_y": fy,
-                    "h": SIZE[0],
-                    "w": SIZE[1],
+                    "h": act.size[0],
+                    "w": act.size[1],
                     "transform_matrix": to_world.tolist(),
                     "file_path": f"images/{name}",
                     "fg_mask_path": f"fg_masks/{name}",
@@ -354,8 +335,8 @@ def write_vhap(
     write_json(path / "transforms.json", top | {"frames": entries})
     if split:
         last = cameras - 1
-        seen = [e for e in entries if e["timestep_index"] < frames - 2]
-        held = [e for e in entries if e["timestep_index"] >= frames - 2]
+        seen = [e for e in entries if e["timestep_index"] < frames - act.held]
+        held = [e for e in entries if e["timestep_index"] >= frames - act.held]
         train = [e for e in seen if cameras == 1 or e["camera_index"] != last]
         val = [e for e in seen if cameras > 1 and e["camera_index"] == last]
         for name, part in (("train", train), ("val", val), ("test", held)):
@@ -363,10 +344,13 @@ def write_vhap(
     return act
 
 
-def write_combined(parent: Path, name: str = "UNION") -> dict[str, Take]:
+def write_combined(
+    parent: Path, name: str = "UNION", *, filmed: tuple[Take, Take] | None = None
+) -> dict[str, Take]:
     """Two exports beside each other and GaussianAvatars' folder that only points to them."""
-    acts = {"EMO-1": write_vhap(parent / "EMO-1", seed=1, split=False)}
-    acts["SEN-2"] = write_vhap(parent / "SEN-2", seed=2, split=False)
+    first, second = filmed or (take(1), take(2))
+    acts = {"EMO-1": write_vhap(parent / "EMO-1", split=False, act=first)}
+    acts["SEN-2"] = write_vhap(parent / "SEN-2", split=False, act=second)
     (parent / name).mkdir()
     steps = 0
     for division, sequence in (("train", "EMO-1"), ("test", "SEN-2")):
@@ -376,31 +360,41 @@ def write_combined(parent: Path, name: str = "UNION") -> dict[str, Take]:
             frame["timestep_index"] += steps
             for key in ("file_path", "fg_mask_path", "flame_param_path"):
                 frame[key] = f"../{sequence}/{frame[key]}"
-        steps += FRAMES
+        steps += len(acts[sequence])
         write_json(parent / name / f"transforms_{division}.json", content)
     write_json(parent / name / "transforms_val.json", {"frames": []})
     return acts
 
 
-def write_vhap_track(path: Path, *, seed: int = 0, frames: int = FRAMES) -> Take:
+def write_vhap_track(
+    path: Path,
+    *,
+    seed: int = 0,
+    frames: int = FRAMES,
+    act: Take | None = None,
+) -> Take:
     """The tracker's own file: frames stacked, a focal length relative to the longer side."""
-    act = take(seed, frames)
+    act = act or take(seed, frames)
+    frames = len(act)
     for folder in ("images", "alpha_maps", "run"):
         (path / folder).mkdir(parents=True)
     to_world = np.eye(4)
     to_world[2, 3] = 1
-    height, width = SIZE
-    focal = FOCAL / max(SIZE)
+    height, width = act.size
+    focal = act.lens[0] / max(act.size)
     rows = []
     for frame in range(frames):
-        content, vertices = vhap_rows(act, frame, dynamic=False)
-        vertices = vertices + np.array([0, 0, 0.15])
-        content["translation"] = content["translation"] + np.float32([0, 0, 0.15])
+        if act.filmed:
+            content, vertices = before_camera(act, frame, OPENGL @ np.linalg.inv(to_world))
+        else:
+            content, vertices = vhap_rows(act, frame, dynamic=False)
+            vertices = vertices + np.array([0, 0, 0.15])
+            content["translation"] = content["translation"] + np.float32([0, 0, 0.15])
         rows.append(content)
-        centred = (FOCAL, FOCAL, width / 2, height / 2)
+        centred = (act.lens[0], act.lens[0], width / 2, height / 2)
         pixels, depth = project_gl(vertices, np.linalg.inv(to_world), centred)
         act.truth[frame] = pixels
-        rgba = picture(pixels, depth)
+        rgba = act.picture(frame, pixels, depth)
         write_rgba(path / f"images/{frame:05d}.png", _opaque(rgba, 200))
         write_gray(path / f"alpha_maps/{frame:05d}.png", rgba[..., 3])
     stacked = {
@@ -412,38 +406,54 @@ def write_vhap_track(path: Path, *, seed: int = 0, frames: int = FRAMES) -> Take
         "static_offset": rows[0]["static_offset"],
         "timestep_id": np.array([f"{frame:05d}" for frame in range(frames)]),
         "focal_length": np.array([focal], np.float32),
-        "image_size": np.array(SIZE),
+        "image_size": np.array(act.size),
     }
     np.savez(path / "run/tracked_flame_params_30.npz", **stacked)
     np.savez(path / "run/tracked_flame_params_3.npz", focal_length=np.zeros(1))
     return act
 
 
-def write_imavatar(path: Path, *, seed: int = 0, pixels_512: bool = False) -> Take:
+def write_imavatar(
+    path: Path,
+    *,
+    seed: int = 0,
+    pixels_512: bool = False,
+    act: Take | None = None,
+) -> Take:
     """FLAME times four, a camera that looks down -z, names without an ending, from 1."""
-    act = take(seed)
+    act = act or take(seed)
     act.shape[100:] = 0
     act.expression[:, 50:] = 0
-    side = SIZE[1]
+    side = act.size[1]
     for folder in ("image", "mask", "semantic"):
         (path / folder).mkdir(parents=True)
     world = np.eye(4)
     world[:3, 3] = [0.05, 0.1, -3.2]
     relative = np.array([-2.0, 2.02, 0.51, 0.47])
+    if act.filmed:
+        fx, fy, cx, cy = np.array(act.lens) / side
+        relative = np.array([-fx, fy, cx, cy])
     entries = []
-    for frame in range(FRAMES):
+    for frame in range(len(act)):
         vertices = posed(act.shape, act.expression[frame], act.turns(frame), scale=4.0)
+        if act.filmed:
+            seen = act.filmed.world_to_camera[frame].copy()
+            seen[:3, 3] += seen[:3, :3] @ act.filmed.translation[frame]
+            seen[:3, 3] *= 4
+            world = OPENGL @ seen
         local = vertices @ world[:3, :3].T + world[:3, 3]
         fx, fy, cx, cy = relative * side
         z = local[:, 2]  # negative before the camera, as fx is
         pixels = np.stack([cx + fx * local[:, 0] / z, cy + fy * local[:, 1] / z], 1)
         act.truth[frame + 1] = pixels
         name = str(frame + 1)
-        rgba = picture(pixels, -z / 4, (side, side))
+        rgba = act.picture(frame, pixels, -z / 4, (side, side))
         write_rgba(path / f"image/{name}.png", _opaque(rgba, 120))
         write_gray(path / f"mask/{name}.png", rgba[..., 3])
         semantic = np.where(rgba[..., 3] > 127, 1, 0).astype(np.uint8)
         semantic[: side // 3] *= 17
+        if act.filmed:
+            semantic = _coded(act.labels(frame), PARSING_CODES)
         write_gray(path / f"semantic/{name}.png", semantic)
         pose = np.concatenate(
             [act.root[frame], act.neck[frame], act.jaw[frame], act.eyes[frame].ravel()]
@@ -466,6 +476,21 @@ def write_imavatar(path: Path, *, seed: int = 0, pixels_512: bool = False) -> Ta
     }
     write_json(path / "flame_params.json", content)
     return act
+
+
+# the number that each of our labels has in INSTA's masks and in face-parsing networks' pictures
+INSTA_CODES = {
+    "face": 250, "eyes": 210, "accessory": 190, "ears": 170, "mouth": 140, "lips": 120, "neck": 110,
+    "cloth": 90, "scalp_hair": 80, "facial_hair": 250,
+}  # fmt: skip
+PARSING_CODES = {
+    "face": 1, "eyes": 4, "accessory": 18, "ears": 7, "mouth": 11, "lips": 12, "neck": 14,
+    "cloth": 16, "scalp_hair": 17, "facial_hair": 1,
+}  # fmt: skip
+
+
+def _coded(labels: np.ndarray, codes: dict[str, int]) -> np.ndarray:
+    return np.array([codes.get(name, 0) for name in LABELS], np.uint8)[labels]
 
 
 def write_nerface(path: Path) -> None:

@@ -13,10 +13,12 @@ from ...head.model import CANONICAL_JAW_DEGREES
 from ...head.skinning import joint_motions, pose_vertices, rotation_matrices
 
 _TURNING = ("jaw", "left_eye", "right_eye")  # the joints that are looked for
-_STEPS = 6
+_STEPS = 10
+_FRESH_STEPS = 2  # of these with derivatives of their own; the later ones move little
+_STILL = 1e-7
 _DIFFERENCE = 1e-5
 _CHUNK = 256
-_SAMPLES = 150  # vertices a part
+_SAMPLES = 100  # vertices a part
 
 
 def canonical_pose(head: HeadModel) -> np.ndarray:
@@ -155,19 +157,22 @@ def _fit_chunk(
         made = pose_vertices({**rest, "template": shaped}, empty, lid, pose, still)
         return made[:, : small["count"]]
 
-    for _ in range(_STEPS):
+    for round_ in range(_STEPS):
         now = posed(values)
         left = (target - now).reshape(frames, -1)
-        columns = []
-        for unknown in range(unknowns):
-            moved = values.copy()
-            moved[:, unknown] += _DIFFERENCE
-            columns.append((posed(moved) - now).reshape(frames, -1) / _DIFFERENCE)
-        jacobian = torch.stack(columns, 1)  # [F, unknowns, 3 K]
-        normal = jacobian @ jacobian.transpose(1, 2)
-        normal += 1e-9 * torch.eye(unknowns, dtype=torch.float64)
-        step = torch.linalg.solve(normal, (jacobian @ left[..., None])[..., 0])
-        values += step.numpy()
+        if round_ < _FRESH_STEPS:
+            columns = []
+            for unknown in range(unknowns):
+                moved = values.copy()
+                moved[:, unknown] += _DIFFERENCE
+                columns.append((posed(moved) - now).reshape(frames, -1) / _DIFFERENCE)
+            jacobian = torch.stack(columns, 1)  # [F, unknowns, 3 K]
+            normal = jacobian @ jacobian.transpose(1, 2)
+            normal += 1e-9 * torch.eye(unknowns, dtype=torch.float64)
+        step = torch.linalg.solve(normal, (jacobian @ left[..., None])[..., 0]).numpy()
+        values += step
+        if np.abs(step).max() < _STILL:
+            break
     pose = np.zeros((frames, joints, 3))
     pose[:, turning] = values[:, :turns].reshape(frames, -1, 3)
     filled = expression.copy()

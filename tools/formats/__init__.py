@@ -1,0 +1,1 @@
+"""Studio pictures wrapped in other programs' formats."""
