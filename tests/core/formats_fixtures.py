@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 from flame_fixture import (
-    SIZE,
     VERTICES,
     flame,
     posed,
@@ -21,9 +20,8 @@ from flame_fixture import (
     write_model,
 )
 from scipy.spatial.transform import Rotation
-from takes import FRAMES, Take, looking_cv, sixes, take
+from takes import FRAMES, INSTA_CODES, PARSING_CODES, Take, coded, looking_cv, sixes, take
 
-from pav_blender.core.collection import LABELS
 from pav_blender.core.head.oracle import rotation_matrix
 from pav_blender.core.images import write_gray, write_rgba
 
@@ -158,8 +156,8 @@ def write_flashavatar(
         inside = (rgba[..., 3] > 127).astype(np.uint8) * 255
         mouth = np.zeros_like(inside)
         if act.filmed:
-            inside = _coded(act.labels(frame), dict.fromkeys(PARSING_CODES, 255) | {"cloth": 0})
-            mouth = _coded(act.labels(frame), {"mouth": 255})
+            inside = coded(act.labels(frame), dict.fromkeys(PARSING_CODES, 255) | {"cloth": 0})
+            mouth = coded(act.labels(frame), {"mouth": 255})
         write_gray(path / f"parsing/{frame + 1:05d}_neckhead.png", inside)
         write_gray(path / f"parsing/{frame + 1:05d}_mouth.png", mouth)
     return act
@@ -194,7 +192,7 @@ def write_insta(
         mask[..., 0] = np.where(rgba[..., 3] > 127, 250, 0)
         mask[: height // 3, :, 0] = np.where(rgba[: height // 3, :, 3] > 127, 80, 0)
         if act.filmed:
-            mask[..., 0] = _coded(act.labels(frame), INSTA_CODES)
+            mask[..., 0] = coded(act.labels(frame), INSTA_CODES)
         mask[..., 3] = 255
         write_rgba(path / f"seg_mask/{name}.png", mask)
         (path / f"meshes/{name}.obj").write_text(obj_text(vertices))
@@ -453,7 +451,7 @@ def write_imavatar(
         semantic = np.where(rgba[..., 3] > 127, 1, 0).astype(np.uint8)
         semantic[: side // 3] *= 17
         if act.filmed:
-            semantic = _coded(act.labels(frame), PARSING_CODES)
+            semantic = coded(act.labels(frame), PARSING_CODES)
         write_gray(path / f"semantic/{name}.png", semantic)
         pose = np.concatenate(
             [act.root[frame], act.neck[frame], act.jaw[frame], act.eyes[frame].ravel()]
@@ -476,21 +474,6 @@ def write_imavatar(
     }
     write_json(path / "flame_params.json", content)
     return act
-
-
-# the number that each of our labels has in INSTA's masks and in face-parsing networks' pictures
-INSTA_CODES = {
-    "face": 250, "eyes": 210, "accessory": 190, "ears": 170, "mouth": 140, "lips": 120, "neck": 110,
-    "cloth": 90, "scalp_hair": 80, "facial_hair": 250,
-}  # fmt: skip
-PARSING_CODES = {
-    "face": 1, "eyes": 4, "accessory": 18, "ears": 7, "mouth": 11, "lips": 12, "neck": 14,
-    "cloth": 16, "scalp_hair": 17, "facial_hair": 1,
-}  # fmt: skip
-
-
-def _coded(labels: np.ndarray, codes: dict[str, int]) -> np.ndarray:
-    return np.array([codes.get(name, 0) for name in LABELS], np.uint8)[labels]
 
 
 def write_nerface(path: Path) -> None:

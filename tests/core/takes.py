@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from flame_fixture import SIZE, picture
 
+from pav_blender.core.collection import LABELS
 from pav_blender.core.head.oracle import rotation_matrix
 from pav_blender.core.images import read_gray, read_rgba
 
@@ -101,3 +102,18 @@ def looking_cv(root: np.ndarray, distance: float = 0.75) -> np.ndarray:
     matrix[:3, :3] = turn
     matrix[:3, 3] = -turn @ centre + [0.01, 0.0, distance]
     return matrix
+
+
+# the number that each of our labels has in INSTA's masks and in face-parsing networks' pictures
+INSTA_CODES = {
+    "face": 250, "eyes": 210, "accessory": 190, "ears": 170, "mouth": 140, "lips": 120, "neck": 110,
+    "cloth": 90, "scalp_hair": 80, "facial_hair": 250,
+}  # fmt: skip
+PARSING_CODES = {
+    "face": 1, "eyes": 4, "accessory": 18, "ears": 7, "mouth": 11, "lips": 12, "neck": 14,
+    "cloth": 16, "scalp_hair": 17, "facial_hair": 1,
+}  # fmt: skip
+
+
+def coded(labels: np.ndarray, codes: dict[str, int]) -> np.ndarray:
+    return np.array([codes.get(name, 0) for name in LABELS], np.uint8)[labels]
