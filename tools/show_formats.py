@@ -71,7 +71,7 @@ def _person(
     _pav("check", path, "--out", out / f"check{version}.png")
     _pav("train", path, "--out", avatar_path, "--minutes", minutes)
     avatar, collection = Avatar.load(avatar_path), read_collection(path)
-    measured = measure(avatar, collection, 3)
+    measured = measure(avatar, collection, 2)
     numbers, others, claims = figures(measured), {}, []
     for name in names:
         clip = next(c for c in collection.clips if c.appearance == name and "test" in c.split)
