@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -44,9 +45,10 @@ def main() -> int:
     wrap.write_models(out / "models")
     for name in ("insta",) if args.only else wrap.SOURCES:
         wrap.write_source(name, studio, out / "sources" / name)
-    fields, claims = {}, []
+    fields: dict[str, Any] = {}
+    claims: list[Claim] = []
     if not args.only:
-        rows = []
+        rows: list[list[np.ndarray]] = []
         for version in wrap.MODELS:
             part, told, shown = _person(version, studio, out, args.minutes)
             fields[f"FLAME {version}"], claims, rows = part, claims + told, rows + shown

@@ -12,7 +12,6 @@ import numpy as np
 from .errors import InputError
 from .files import replacing
 
-
 _NONE, _AVERAGE = 8, 64  # libpng's names for a row's filter
 
 

@@ -25,15 +25,17 @@ def offset_to(
     expression [E], pose [J, 3], translation [3]. The joints are read off the head with its offset,
     so that this is a fixed point: some rounds of turning what is left back to rest.
     """
+    parents = head.joint_parents.tolist()
     turns = rotation_matrices(torch.tensor(pose, dtype=torch.float64)[None])
-    motions, _ = joint_motions(turns, torch.zeros(1, len(pose), 3).double(), head.joint_parents)
+    motions, _ = joint_motions(turns, torch.zeros(1, len(pose), 3).double(), parents)
     weights = torch.tensor(head.skinning_weights, dtype=torch.float64)
     blended = torch.einsum("vj,jab->vab", weights, motions[0])
     back = torch.linalg.inv(blended).numpy()
-    moved = [torch.tensor(each, dtype=torch.float64)[None] for each in (expression, pose)]
+    values = torch.tensor(expression, dtype=torch.float64)[None]
+    turned = torch.tensor(pose, dtype=torch.float64)[None]
     offset = np.zeros(vertices.shape)
     for _ in range(_ROUNDS):
-        posed = head.pose(betas, *moved, translation[None], offset=offset)[0].numpy()
+        posed = head.pose(betas, values, turned, translation[None], offset=offset)[0].numpy()
         left = vertices - posed
         if np.abs(left).max() < _CLOSE:
             break

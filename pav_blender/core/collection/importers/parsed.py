@@ -97,7 +97,7 @@ def stacked(name: str, tool: str, rows: list[dict[str, Any]], **rest: Any) -> Pa
         raise InputError(f"{name}: no frame of this {tool} source can be used{why}")
     used = [kept[number] for number in sorted(kept)]
     for key in (*_ROW, *_OPTIONAL):
-        if len({np.shape(row.get(key)) for row in used if row.get(key) is not None}) > 1:
+        if len({np.shape(row[key]) for row in used if row.get(key) is not None}) > 1:
             raise InputError(f"{name}: its frames differ in the size of {key}")
     arrays: dict[str, Any] = {
         key: np.stack([np.asarray(row[key], np.float64) for row in used]) for key in _ROW
