@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ..core.progress import Progress
+
+if TYPE_CHECKING:
+    from ..core.collection.importers import ParsedClip
+    from ..core.head import HeadModel
 
 SUMMARY = (
     "Make a collection of what INSTA, metrical-tracker, VHAP, GaussianAvatars, IMavatar or "
@@ -22,8 +27,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--head",
         type=Path,
-        help="FLAME's model: a .pkl, a converted .npz, or a folder with one; remembered by its "
-        "fingerprint, so that alone it makes a head known on this machine",
+        help="FLAME's model: a .pkl, a converted .npz, or a folder with one (or another head that "
+        "was exported); remembered by its fingerprint, so that alone it makes a head known on this "
+        "machine, and need not be named again",
     )
     parser.add_argument(
         "--format",
@@ -59,15 +65,20 @@ def run(args: argparse.Namespace) -> int:
     from ..core.errors import InputError
     from ..core.head import remember_head
 
-    if args.head is None:
-        raise InputError("--head is missing: FLAME's model, which the sources were tracked with")
+    if args.head is None and not args.sources:
+        raise InputError("name sources to import, or with --head a head to remember")
     if args.sources and not (args.out or args.dry_run):
         raise InputError("--out is missing: the collection folder to write (or --dry-run)")
     if args.hold_out is not None and args.hold_out < 0:
         raise InputError(f"--hold-out {args.hold_out}: 0 or more")
     if args.out and args.out.exists() and not (args.overwrite or args.dry_run):
         raise InputError(f"{args.out}: exists already; choose another folder, or --overwrite")
-    head = remember_head(args.head, flame_version=args.flame_version)
+    head = args.head and remember_head(args.head, flame_version=args.flame_version)
+    parsed = []
+    if args.sources:
+        reading = Progress("read", as_json=args.json_progress)
+        parsed = read_sources(args.sources, args.format, reading)
+        head = head or _known(parsed, args.tracked_with)
     print(
         f"head: {head.name}, {len(head.expression_names)} expressions, "
         f"{len(head.landmark_triangles)} landmarks, fingerprint {head.fingerprint[:12]}\n"
@@ -76,8 +87,6 @@ def run(args: argparse.Namespace) -> int:
     if not args.sources:
         print("remembered; no sources were named")
         return 0
-    reading = Progress("read", as_json=args.json_progress)
-    parsed = read_sources(args.sources, args.format, reading)
     person: Person = normalise(
         parsed,
         head,
@@ -98,6 +107,20 @@ def run(args: argparse.Namespace) -> int:
     )
     print(f"wrote {args.out}")
     return 0
+
+
+def _known(parsed: list[ParsedClip], tracked_with: str) -> HeadModel:
+    """The head that these clips need, where it was named once before."""
+    from ..core.errors import InputError
+    from ..core.head import remembered_head
+
+    first = parsed[0]
+    version = tracked_with or first.flame
+    found = remembered_head("" if first.head else version, first.head)
+    if found is None:
+        what = "the head they were exported with" if first.head else f"FLAME {version}'s model"
+        raise InputError(f"--head is missing: {what}, which these clips were tracked with")
+    return found
 
 
 def _say(person) -> None:  # type: ignore[no-untyped-def]

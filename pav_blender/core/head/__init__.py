@@ -2,7 +2,7 @@
 
 from .builtin import BUILTIN, builtin_head
 from .files import read_head, write_head
-from .library import load_head, remember_head
+from .library import load_head, remember_head, remembered_head
 from .model import HeadModel
 from .shape_keys import head_from_shape_keys
 
@@ -14,5 +14,6 @@ __all__ = [
     "load_head",
     "read_head",
     "remember_head",
+    "remembered_head",
     "write_head",
 ]

@@ -71,6 +71,20 @@ def remember_head(path: str | Path, *, flame_version: str = "") -> HeadModel:
     return head
 
 
+def remembered_head(version: str = "", fingerprint: str = "") -> HeadModel | None:
+    """The head of this fingerprint, or the only FLAME of this version, that is known on this
+    machine; None where there is none, or several."""
+    known = preferences.read(_SECTION)
+    if fingerprint == builtin_head().fingerprint:
+        return builtin_head()
+    if fingerprint:
+        found = [fingerprint] if fingerprint in known else []
+    else:
+        found = [k for k, e in known.items() if isinstance(e, dict) and e.get("version") == version]
+        found = [k for k in found if not _missing(known[k])]
+    return load_head(f"FLAME {version}", found[0]) if len(found) == 1 else None
+
+
 def _read(path: Path, flame_version: str) -> tuple[HeadModel, dict[str, str]]:
     if not path.exists():
         raise InputError(f"{path}: no such head file")
