@@ -26,7 +26,7 @@ from pav_blender.core.images import read_rgba, write_rgba
 from pav_blender.core.training.frames import camera_of
 from tools.formats import crowd, wrap
 
-HEAD_PSNR = 18.0
+HEAD_PSNR = 16.0  # another subject's pictures come to 14.1 dB at most
 SECONDS, FRAMES, SIZE = 60.0, 1500, 512
 NEAR = 1.0  # pixels of 256, mean: how far vertices may lie from where the studio's camera saw them
 DATA = Path(__file__).resolve().parents[1] / "data" / "studio3"
