@@ -32,6 +32,7 @@ _SHARED = 0.7
 _FOREHEAD, _CHIN = 10, 152
 _LEFT_PUPIL, _RIGHT_PUPIL = 473, 468
 USUAL_RATE = 30.0
+_DAMPING = 1e-3
 
 
 @dataclass(eq=False)
@@ -175,7 +176,7 @@ def _descend(
     before_step: Callable[[_State], None] | None = None,
 ) -> _State:
     """Levenberg-Marquardt; the terms' weights are found anew for every step."""
-    damping, previous = 1e-3, np.inf
+    damping, previous = _DAMPING, np.inf
     for number in range(steps):
         if should_stop is not None and should_stop():
             raise Cancelled("tracking stopped; nothing was written")

@@ -29,7 +29,7 @@ SCORE_SPREAD = 0.3
 # and the distance one is filmed from; spreads are of logarithms.
 FOCAL_OF_SIDE, FOCAL_OF_SIDE_SPREAD = 1.3, 0.6
 METRES_AWAY, METRES_AWAY_SPREAD = 1.2, 0.3
-FOCAL_SPREAD = 0.3
+FOCAL_SPREAD = 0.1
 ROOT_SPREAD, NECK_SPREAD = 0.12, 0.25
 # A landmark's place on the head is itself uncertain, and no number of frames cures that: so many
 # frames of a clip add up to one independent look at what stays the same (identity, lens).
