@@ -1,0 +1,90 @@
+"""Measuring a track against the truth, on errors that were put there."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pav_blender.benchmarks.track import claims
+from pav_blender.core.collection import read_collection
+from pav_blender.core.errors import InputError
+from pav_blender.core.evaluation.tracking import compare
+from pav_blender.core.tracking.landmark_model import axis_angles, rotations
+
+STUDIO = Path(__file__).parents[2] / "data" / "studio3"
+
+
+@pytest.fixture(scope="module")
+def truth():
+    collection = read_collection(STUDIO)
+    clip = collection.clips[0]
+    rows = clip.indices("train")[:12]
+    parts = ("expression", "pose", "translation", "intrinsics", "camera_to_world", "frame_id")
+    few = replace(
+        clip, split=clip.split[rows], **{name: getattr(clip, name)[rows] for name in parts}
+    )
+    few.vertices = None
+    return replace(collection, clips=[few])
+
+
+def _found(truth, **changes):
+    clip = replace(truth.clips[0], **changes)
+    focal = float(clip.intrinsics[0, 0, 0])
+    extra = {"tracking": {"clips": [{"name": clip.name, "focal_pixels": focal}]}}
+    return replace(truth, clips=[clip], extra=extra)
+
+
+def test_the_truth_has_no_error(truth):
+    errors = compare(truth, _found(truth))
+    assert errors.frames == errors.filmed == 12
+    assert errors.reprojection_px < 1e-3
+    assert errors.rotation_deg < 1e-2
+    assert errors.expression_mm < 1e-3
+    assert errors.shape_mm < 1e-3
+    assert errors.focal_percent == 0
+    assert errors.jitter == pytest.approx(1, abs=1e-4)
+
+
+def test_a_turn_and_a_smile_too_much_are_told_apart(truth):
+    pose = truth.clips[0].pose.astype(np.float64)
+    turned = pose.copy()
+    turned[:, 1] = axis_angles(rotations(pose[:, 1]) @ rotations(np.radians([0, 2.0, 0])))
+    errors = compare(truth, _found(truth, pose=turned.astype(np.float32)))
+    assert errors.rotation_deg == pytest.approx(2, abs=0.01)
+    assert errors.expression_mm < 1e-3
+    assert errors.reprojection_px > 0.5
+    wide = truth.clips[0].expression.copy()
+    wide[:, truth.head.expression_names.index("mouthSmileLeft")] += 0.5
+    errors = compare(truth, _found(truth, expression=wide))
+    assert errors.rotation_deg < 1e-2
+    assert errors.expression_mm > 0.2
+
+
+def test_another_person_with_the_same_motion(truth):
+    other = replace(_found(truth), betas=truth.betas * 0.5)
+    errors = compare(truth, other)
+    assert errors.shape_mm > 1
+    assert errors.expression_mm < errors.shape_mm
+    assert errors.face_mm > errors.expression_mm
+
+
+def test_trembling_is_counted_against_the_truths_own(truth):
+    shaken = truth.clips[0].translation.copy()
+    shaken[::2, 0] += 0.004
+    errors = compare(truth, _found(truth, translation=shaken))
+    assert errors.jitter > 1.5
+
+
+def test_what_cannot_be_compared_is_said(truth):
+    with pytest.raises(InputError, match="focal length"):
+        compare(truth, replace(truth, extra={}))
+    numbers = truth.clips[0].frame_id + 1000
+    with pytest.raises(InputError, match="shares no frame"):
+        compare(truth, _found(truth, frame_id=numbers))
+
+
+def test_a_bad_track_meets_no_claim():
+    row = {"size": 512, "reprojection_px": 9.0, "rotation_deg": 9.0, "expression_mm": 9.0,
+           "jitter": 9.0, "seconds_a_frame": 9.0}  # fmt: skip
+    assert not any(claim.met for claim in claims([row, {**row, "size": 256}]))
