@@ -17,6 +17,7 @@ from ..files import replacing
 from ..images import write_rgba
 from ..progress import Report
 from ..rendering.rasterise import rasterise
+from ..tracking.landmark_model import LandmarkModel
 from ..tracking.sift import ranges
 from ..training.frames import camera_of, load_picture
 from .sheet import grid
@@ -52,16 +53,20 @@ def landmark_errors(collection: Collection, clip: Clip) -> Errors | None:
     if seen is None or seen.shape[1] <= _LEFT_PUPIL:
         return None
     away = np.empty(len(clip))
+    points = _tracked(collection, clip)
     for row in range(len(clip)):
-        away[row] = np.median(np.linalg.norm(_tracked(collection, clip, row) - seen[row], axis=1))
+        pixels, _ = camera_of(clip, row).project(points[row])
+        away[row] = np.median(np.linalg.norm(pixels - seen[row], axis=1))
     eyes = np.linalg.norm(seen[:, _LEFT_PUPIL] - seen[:, _RIGHT_PUPIL], axis=1)
     return Errors(clip, 100 * away / max(float(np.median(eyes)), 1e-6))
 
 
-def _tracked(collection: Collection, clip: Clip, row: int) -> np.ndarray:
-    """The tracked head's landmarks in the picture, [L, 2] pixels."""
-    vertices = collection.posed(clip, np.array([row]))[0]
-    return camera_of(clip, row).project(collection.head.landmarks(vertices))[0]
+def _tracked(collection: Collection, clip: Clip) -> np.ndarray:
+    """The tracked head's landmarks, where the detector would see them, [F, L, 3] metres."""
+    if clip.vertices is not None:
+        return np.asarray(collection.head.landmarks(clip.vertices))
+    model = LandmarkModel(collection.head, len(collection.betas))
+    return model.pose(collection.betas, clip.expression, clip.pose, clip.translation).points
 
 
 def left_out(collection: Collection) -> list[tuple[str, str, str]]:
