@@ -179,7 +179,7 @@ def _descend(
     damping, previous = _DAMPING, np.inf
     for number in range(steps):
         if should_stop is not None and should_stop():
-            raise Cancelled("tracking stopped; nothing was written")
+            raise Cancelled("tracking stopped; the same command goes on from here")
         if before_step is not None:
             before_step(state)
         for terms, clip in zip(problem.terms, state.clips, strict=True):
