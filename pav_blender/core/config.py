@@ -80,6 +80,7 @@ class Config:
     decay_from: float = 0.4  # part of the schedule after which the rates fall
     final_learning_rate: float = 0.03  # as a part of the first, at the end of the schedule
     seed: int = 0
+    refine_poses: bool = False  # correct the track of frames while learning from them
 
     def __post_init__(self) -> None:
         if self.appearance not in APPEARANCE_MODES:

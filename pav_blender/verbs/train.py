@@ -7,6 +7,7 @@ import dataclasses
 import signal
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 from ..core.progress import Progress
 
@@ -22,6 +23,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--preset", default="default", help="default, or paper: its own settings")
     parser.add_argument("--device", default="cpu", help="of the networks: cpu, cuda or mps")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--refine-poses",
+        action="store_true",
+        help="correct pose and expressions of each frame a little while learning; of a clip only "
+        "where that helps frames kept out",
+    )
+    parser.add_argument(
+        "--refined-collection",
+        type=Path,
+        metavar="DIR",
+        help="write the collection with its track corrected (needs --refine-poses)",
+    )
     parser.add_argument("--resume", action="store_true", help="go on from the last checkpoint")
 
 
@@ -45,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
     from ..core.devices import device_of
     from ..core.training.train import train
 
-    changes = {"seed": args.seed}
+    changes = {"seed": args.seed, "refine_poses": args.refine_poses}
     if args.iterations is not None:
         changes["iterations"] = args.iterations
     config = dataclasses.replace(Config.preset(args.preset), **changes)
@@ -55,15 +68,39 @@ def run(args: argparse.Namespace) -> int:
         config,
         minutes=args.minutes,
         resume=args.resume,
+        refined=args.refined_collection,
         device=device_of(args.device),
         progress=Progress("train", as_json=args.json_progress),
         loading=Progress("read", as_json=args.json_progress),
+        refining=Progress("refine", as_json=args.json_progress),
         should_stop=StopSignal(),
     )
     record = avatar.record
+    for name, clip in record.get("refinement", {}).items():
+        print(f"{name}: {_refinement(clip)}")
+    if args.refined_collection is not None:
+        print(f"{args.refined_collection}: the collection with its track corrected")
     print(
         f"{args.out}: {len(avatar.appearances)} appearances ({', '.join(avatar.appearances)}), "
         f"{record['iterations']} iterations in {record['seconds']:.0f} s, "
         f"{record['batch_psnr']:.1f} dB on training rays"
     )
     return 0
+
+
+def _refinement(clip: dict[str, Any]) -> str:
+    """What came of correcting a clip's track, as one line."""
+    if clip["psnr_tracked"] is None:
+        return "track not corrected: too few training frames to keep some out"
+    gains = f"{clip['psnr_tracked']:.2f} dB as tracked, {clip['psnr_pose']:.2f} with pose corrected"
+    if clip["psnr_expression"] is not None:
+        gains += f", {clip['psnr_expression']:.2f} with expressions too"
+    if clip["kept"] == "off":
+        return f"track not corrected, since that did not help frames kept out: {gains}"
+    size = ""
+    if clip["frames"]:
+        size = (
+            f"; {clip['frames']} frames by {clip['degrees']:.2f} degrees and "
+            f"{clip['millimetres']:.2f} mm in the mean"
+        )
+    return f"{clip['kept']} corrected{size}; frames kept out: {gains}"

@@ -59,6 +59,7 @@ class Picked:
 
 @dataclass(eq=False)
 class _Posed:
+    vertices: np.ndarray
     mesh: PosedMesh
     stance: Stance
     voxels: Voxels
@@ -78,10 +79,11 @@ class Poses:
     def __call__(self, frame: Frame, space: Clearance, version: int, reach: float) -> _Posed:
         """The frame posed; its voxels are those of `version` of the space, or a later one."""
         known = self._kept.get(frame.name)
-        if known is None:
+        if known is None or known.vertices is not frame.vertices:  # a corrected one has others
             mesh = self._deformer.pose(frame.vertices)
             meshes = self._canonical, frame.vertices, self._weights
-            known = _Posed(mesh, stance(*meshes), voxels(mesh, space, reach), version)
+            filled = voxels(mesh, space, reach)
+            known = _Posed(frame.vertices, mesh, stance(*meshes), filled, version)
             self._kept[frame.name] = known
             if len(self._kept) > KEPT_POSES:
                 self._kept.popitem(last=False)

@@ -31,6 +31,10 @@ def save_checkpoint(path: Path, trainer: Trainer, source: str) -> None:
         tensors[f"m.{name}"], tensors[f"v.{name}"] = m, v
     tensors |= {f"seen.{name}": value for name, value in trainer.visibility.state().items()}
     tensors |= {f"drawn.{name}": value for name, value in trainer.attention.state().items()}
+    refinement = None
+    if trainer.refiner is not None:
+        corrections, refinement = trainer.refiner.state()
+        tensors |= {f"corrected.{name}": value for name, value in corrections.items()}
     tensors["generator"] = trainer.generator.get_state()
     header = {
         "format": FORMAT,
@@ -40,6 +44,7 @@ def save_checkpoint(path: Path, trainer: Trainer, source: str) -> None:
         "status": dataclasses.asdict(trainer.status),
         "pools": [[group, pool] for group, pool in trainer.pools.items()],
         "random": trainer.random.bit_generator.state,
+        "refinement": refinement,
     }
     with replacing(path) as temporary:
         safetensors.torch.save_file(
@@ -80,5 +85,8 @@ def load_checkpoint(path: Path, trainer: Trainer, source: str) -> None:
         trainer.random.bit_generator.state = header["random"]
         trainer.pools = {int(group): list(pool) for group, pool in header["pools"]}
         trainer.status = Status(**header["status"])
+        if trainer.refiner is not None:
+            named = {k[10:]: v for k, v in tensors.items() if k.startswith("corrected.")}
+            trainer.refiner.restore(named, header["refinement"])
     except (KeyError, RuntimeError, ValueError, TypeError) as error:
         raise InputError(f"{path}: does not fit this training; remove it to begin anew") from error

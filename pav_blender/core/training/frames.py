@@ -82,7 +82,6 @@ def load_frames(
     if len(rows) == 0:
         return []
     appearance = collection.appearances.index(clip.appearance)
-    face = _face_triangles(collection)
     posed = collection.posed(clip, rows)
     frames = []
     for done, row in enumerate(rows):
@@ -90,9 +89,7 @@ def load_frames(
         camera = camera_of(clip, row)
         depth = np.zeros(rgba.shape[:2], np.float16)
         if targets:
-            surface, triangle, _ = rasterise(posed[done], collection.head.triangles, camera)
-            seen = (triangle >= 0) & face[triangle] & (rgba[..., 3] > 200)
-            depth[seen] = surface[seen]
+            depth = face_depth(collection, rgba, posed[done], camera)
         frames.append(
             Frame(
                 rgba,
@@ -108,6 +105,15 @@ def load_frames(
         if progress:
             progress((done + 1) / len(rows), frame=frames[-1].name)
     return frames
+
+
+def face_depth(
+    collection: Collection, rgba: np.ndarray, vertices: np.ndarray, camera: Camera
+) -> np.ndarray:
+    """Metres [H, W] float16 along z of a posed mesh [V, 3] where the face shows; 0 elsewhere."""
+    surface, triangle, _ = rasterise(vertices, collection.head.triangles, camera)
+    seen = (triangle >= 0) & _face_triangles(collection)[triangle] & (rgba[..., 3] > 200)
+    return np.where(seen, surface, 0).astype(np.float16)
 
 
 def _face_triangles(collection: Collection) -> np.ndarray:

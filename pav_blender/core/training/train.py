@@ -17,6 +17,8 @@ from ..kernels.cpu.threads import torch_alone
 from ..progress import Report
 from .checkpoint import checkpoint_path, load_checkpoint, save_checkpoint
 from .prepare import load_training_frames, new_avatar
+from .refined import correct_collection, refined_writer, write_refined
+from .refiner import Refiner, kept_out
 from .trainer import Trainer
 
 _CHECKPOINT_SECONDS = 30.0
@@ -29,16 +31,19 @@ def train(
     *,
     minutes: float | None = None,
     resume: bool = False,
+    refined: Path | str | None = None,
     progress: Report | None = None,
     loading: Report | None = None,
+    refining: Report | None = None,
     should_stop: Callable[[], bool] | None = None,
     device: torch.device | str = "cpu",
 ) -> Avatar:
     """Trains an avatar on the "train" frames of a collection and writes it to `out`.
 
     minutes: plan for this much time in the loop instead of `config.iterations`. A checkpoint is
-    kept beside `out` while the work goes on; `resume=True` continues from it. Raises Cancelled
-    (the checkpoint stays) when `should_stop()`, InputError for bad input.
+    kept beside `out` while the work goes on; `resume=True` continues from it. refined: where
+    `config.refine_poses` is on, the folder for the collection with its track corrected. Raises
+    Cancelled (the checkpoint stays) when `should_stop()`, InputError for bad input.
     """
     if not isinstance(collection, Collection):
         collection = read_collection(collection)
@@ -50,10 +55,20 @@ def train(
     saved = checkpoint_path(out)
     if resume and not saved.is_file():
         raise InputError(f"{saved}: no checkpoint to resume from")
+    config = config or Config()
+    if refined is not None and not config.refine_poses:
+        raise InputError(f"--refined-collection {refined}: goes with --refine-poses only")
+    if refined is not None:
+        refined_writer(collection, refined, {})  # refuses now what it would refuse at the end
     frames = load_training_frames(collection, loading)
     source = fingerprint(collection)
-    avatar = new_avatar(collection, frames, config or Config())
-    trainer = Trainer(avatar, frames, minutes=minutes, device=device)
+    held = kept_out(collection, frames) if config.refine_poses else set()
+    learned = [frame for frame in frames if frame.name not in held]
+    avatar = new_avatar(collection, frames, config)
+    trainer = Trainer(avatar, learned, minutes=minutes, device=device)
+    refiner = None
+    if config.refine_poses:
+        refiner = trainer.refiner = Refiner(collection, frames, held, trainer)
     if resume:
         load_checkpoint(saved, trainer, source)
     last_saved = time.monotonic()
@@ -74,7 +89,13 @@ def train(
             last_saved = time.monotonic()
         if stopping:
             raise Cancelled(f"training was stopped; `--resume` goes on from {saved}")
+    if refined is not None and refiner is not None:
+        save_checkpoint(saved, trainer, source)
+        correct_collection(refiner, progress=refining, should_stop=should_stop)
+        write_refined(refiner, refined)
     avatar.field.cpu()
+    if refiner is not None:
+        avatar.record["refinement"] = refiner.record()
     avatar.record |= {
         "iterations": trainer.status.iteration,
         "seconds": round(trainer.status.seconds, 1),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -13,7 +14,8 @@ from .. import kernels
 from ..config import Config
 from ..deformation import Deformer
 from ..field.avatar import Avatar
-from ..field.field import Samples
+from ..field.field import Samples, condition
+from ..rendering.render import Scene
 from .attention import Attention
 from .batches import KEPT_POSES, Poses, draw_pixels, pick_samples
 from .frames import Frame, halved
@@ -49,6 +51,19 @@ class Status:
     filled: float = 1.0
     step: float = 1e-3
     rays: int = 1
+
+
+class Refines(Protocol):
+    """Corrects frames; is told before each batch which part of the schedule is done. `state` is
+    what an interrupted training must keep."""
+
+    def advance(self, done: float) -> None: ...
+
+    def __call__(self, frame: Frame) -> Frame: ...
+
+    def state(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]: ...
+
+    def restore(self, tensors: dict[str, torch.Tensor], header: dict[str, Any]) -> None: ...
 
 
 class Trainer:
@@ -87,6 +102,8 @@ class Trainer:
             if name in ("tables", "still_tables"):
                 parameter.requires_grad_(False)
         self.pools: dict[int, list[int]] = {}
+        # what makes of frames drawn from whole pictures those that are learned from
+        self.refiner: Refines | None = None
         self._mse = math.nan
 
     @property
@@ -100,7 +117,12 @@ class Trainer:
         """One iteration: batch, loss, backward, Adam; the occupancy now and then."""
         started = time.monotonic()
         config, status, field = self.config, self.status, self.avatar.field
-        pixels = draw_pixels(self._choose_frames(), status.rays, self.random, self.attention)
+        if self.refiner is not None:
+            self.refiner.advance(self.done)
+        frames = self._choose_frames()
+        if self.refiner is not None:
+            frames = [self.refiner(frame) for frame in frames]
+        pixels = draw_pixels(frames, status.rays, self.random, self.attention)
         count = len(pixels.rays)
         with torch.no_grad():
             picked = pick_samples(
@@ -132,6 +154,22 @@ class Trainer:
         self._plan(picked.looks / max(count, 1))
         status.seconds += time.monotonic() - started
         return status
+
+    def learn_from(self, frames: list[Frame]) -> None:
+        """Takes in more frames of appearances that are there, once pictures are whole."""
+        for group in self._pyramid[0]:
+            group += [frame for frame in frames if frame.appearance == group[0].appearance]
+
+    def scene(self, frame: Frame) -> Scene:
+        """The avatar as it is now in a frame's pose, to be rendered."""
+        row, field = frame.appearance, self.avatar.field
+        space, version = self.visibility.spaces[row], self.visibility.version
+        posed = self._poses(frame, space, version, self.config.reach)
+        with torch.no_grad():
+            worn = field.blend(torch.eye(len(self.avatar.appearances))[row])
+            seen = condition(self.config, frame.expression, posed.stance.turn)
+        guide = self.visibility.guide[row]
+        return Scene(self.avatar, posed.mesh, space, posed.voxels, guide, posed.stance, seen, worn)
 
     def _choose_frames(self) -> list[Frame]:
         """Frames of a batch: appearances in turn, frames at random; small pictures come first."""
