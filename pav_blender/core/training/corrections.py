@@ -17,7 +17,7 @@ RIGID = 6  # three of rotation (axis times radians), three of translation (metre
 _EXPRESSIONS = 8  # those that move the head most in this collection
 _TURN = np.radians(0.5)  # standard deviations of a track's errors, for the prior: radians,
 _SHIFT = 1.5e-3  # metres,
-_SKIN = 0.5e-3  # and metres that one expression is off where it moves the skin
+_SKIN = 1.5e-3  # and metres that one expression is off where it moves the skin
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +26,7 @@ class Space:
     middle, in world axes, then changes of the expressions in `rows` [K].
 
     sigma [6 + K]: the prior's standard deviations; low, high [K]: the range of those expressions
-    in the whole track, that none leaves.
+    in what is learned from, beyond which none is taken.
     """
 
     rows: np.ndarray
@@ -41,7 +41,8 @@ class Space:
         """The correction with the expression [E] of the track it is for kept in range."""
         own = expression[self.rows].astype(np.float64)
         out = correction.copy()
-        out[RIGID:] = np.clip(own + correction[RIGID:], self.low, self.high) - own
+        low, high = np.minimum(self.low, own), np.maximum(self.high, own)
+        out[RIGID:] = np.clip(own + correction[RIGID:], low, high) - own
         return out
 
 

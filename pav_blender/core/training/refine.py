@@ -23,6 +23,9 @@ _PIXELS = 0.5  # how far rays are moved for a gradient
 _HUBER = 0.1  # colour beyond which a difference counts less: what no motion explains
 _ALIKE = 24.0  # differences that tell the same: four channels of neighbouring pixels
 _LEAST_NOISE = 0.01
+_ALONG = 1 / 3  # the prior's deviation along the view, as a part of that across it
+_DAMPING = 1e-3
+_LEAP = 2.0  # prior's deviations that one step may go
 _SETTINGS = RenderSettings.preset("preview")
 
 
@@ -88,6 +91,7 @@ def correct(
     """
     free = len(space) if changes is not None and len(changes) else RIGID
     current = start.copy()
+    precision = _precision(space, sight.camera)
     best, least = current, np.inf
     jacobian = hit = None
     for left in range(iterations, -1, -1):
@@ -98,14 +102,14 @@ def correct(
             rays.origins = rays.origins - torch.from_numpy(hit.moved(changes, bent))
         shown, points = _trace(scene, rays)
         difference = shown - sight.colours
-        cost = _cost(difference, current, space)
+        cost = _cost(difference, current, precision)
         if cost < least:
             best, least = current, cost
         if left == 0:
             break
         if jacobian is None:  # motions are of a pixel or two: it stays what it is
             jacobian, hit = _jacobian(scene, camera, rays, points, middle, changes, free)
-        current = _step(jacobian, difference, current, space, free)
+        current = _step(jacobian, difference, current, precision)
         current = space.bounded(current, expression)
     return best
 
@@ -192,18 +196,31 @@ def _weights(difference: np.ndarray) -> np.ndarray:
     return _HUBER / np.maximum(size, _HUBER)
 
 
-def _cost(difference: np.ndarray, correction: np.ndarray, space: Space) -> float:
+def _precision(space: Space, camera: Camera) -> np.ndarray:
+    """The prior's inverse covariance [6 + K, 6 + K]. Along the view it is narrow: a head that is a
+    millimetre farther away looks the same, and what moved it there would be noise."""
+    precision = np.diag(space.sigma**-2)
+    shift = slice(3, RIGID)
+    axes = camera.camera_to_world[:3, :3]
+    precision[shift, shift] = (
+        axes @ (precision[shift, shift] @ np.diag([1, 1, _ALONG**-2])) @ axes.T
+    )
+    return precision
+
+
+def _cost(difference: np.ndarray, correction: np.ndarray, precision: np.ndarray) -> float:
     """What is minimised, up to the noise: robust mean squares and the prior."""
     size = np.sqrt((difference**2).mean(1))
     robust = np.where(size < _HUBER, size**2, _HUBER * (2 * size - _HUBER))
-    prior = ((correction / space.sigma) ** 2).sum() * _ALIKE / max(difference.size, 1)
+    prior = float(correction @ precision @ correction) * _ALIKE / max(difference.size, 1)
     return float(robust.mean() + _LEAST_NOISE**2 * prior)
 
 
 def _step(
-    jacobian: np.ndarray, difference: np.ndarray, current: np.ndarray, space: Space, free: int
+    jacobian: np.ndarray, difference: np.ndarray, current: np.ndarray, precision: np.ndarray
 ) -> np.ndarray:
     """One damped step: the prior pulls to the track as far as the pixels leave it open."""
+    free = jacobian.shape[2]
     weights = _weights(difference)
     telling = np.abs(jacobian).sum((1, 2)) > 0
     if telling.sum() < 2 * free:
@@ -212,13 +229,14 @@ def _step(
     rows, wrong = jacobian[telling], difference[telling]
     noise = max(float((weights[:, None] * wrong**2).mean()), _LEAST_NOISE**2) * _ALIKE
     weighted = rows * weights[:, None, None]
-    sigma = space.sigma[:free]
-    normal = np.einsum("rcf,rcg->fg", weighted, rows) / noise
-    pull = np.einsum("rcf,rc->f", weighted, wrong) / noise + current[:free] / sigma**2
+    prior = precision[:free, :free]
+    normal = np.einsum("rcf,rcg->fg", weighted, rows) / noise + prior
+    pull = np.einsum("rcf,rc->f", weighted, wrong) / noise + prior @ current[:free]
     # in units of the prior, so that the damping means the same for radians and metres
-    scaled = normal * np.outer(sigma, sigma) + np.eye(free)
-    scaled += 1e-3 * np.diag(np.diag(scaled))
-    change = -np.linalg.solve(scaled, pull * sigma) * sigma
+    unit = 1 / np.sqrt(np.diag(prior))
+    scaled = normal * np.outer(unit, unit)
+    scaled += _DAMPING * np.diag(np.diag(scaled))
+    change = -np.linalg.solve(scaled, pull * unit) * unit
     out = current.copy()
-    out[:free] += np.clip(change, -2 * sigma, 2 * sigma)
+    out[:free] += np.clip(change, -_LEAP * unit, _LEAP * unit)
     return out
