@@ -91,7 +91,7 @@ def run(args: argparse.Namespace) -> int:
 def _refinement(clip: dict[str, Any]) -> str:
     """What came of correcting a clip's track, as one line."""
     if clip["psnr_tracked"] is None:
-        return "track not corrected: too few training frames to keep some out"
+        return "track not corrected: too few frames, or too short a training, to tell"
     gains = f"{clip['psnr_tracked']:.2f} dB as tracked, {clip['psnr_pose']:.2f} with pose corrected"
     if clip["psnr_expression"] is not None:
         gains += f", {clip['psnr_expression']:.2f} with expressions too"

@@ -1,4 +1,5 @@
 import dataclasses
+import json
 
 import numpy as np
 import pytest
@@ -25,9 +26,11 @@ from pav_blender.core.training.corrections import (
     space_of,
 )
 from pav_blender.core.training.frames import load_frames
+from pav_blender.core.training.prepare import load_training_frames, new_avatar
 from pav_blender.core.training.refined import refined_writer
 from pav_blender.core.training.refiner import EXPRESSION, OFF, POSE, Verdict
 from pav_blender.core.training.train import train
+from pav_blender.core.training.trainer import Trainer
 
 TURN, SHIFT = np.radians(2.0), 3e-3  # how wrong the tracks are made, in the mean
 
@@ -301,6 +304,32 @@ def test_the_same_input_gives_the_same_and_so_does_a_stopped_training(
         assert np.abs(one.expression - clip.expression).max() > 1e-4
         np.testing.assert_allclose(one.pose, other.pose, atol=1e-5)
         np.testing.assert_allclose(one.expression, other.expression, atol=1e-4)
+
+
+def test_hostile_pictures_do_no_harm(toy, small_config, always):
+    """Frames with nothing on them, with one pixel, or of noise: no correction runs away."""
+    frames, random = load_training_frames(toy), np.random.default_rng(0)
+    for number, frame in enumerate(frames):
+        rgba = np.zeros_like(frame.rgba)
+        if number % 3 == 1:
+            rgba[20, 30] = 255
+        elif number % 3 == 2:
+            rgba = random.integers(0, 256, frame.rgba.shape, np.uint8)
+        frames[number] = dataclasses.replace(frame, rgba=rgba)
+    config = dataclasses.replace(small_config, refine_poses=True)
+    held = refiner.kept_out(toy, frames)
+    blank = {frame.name for frame in frames if not frame.rgba.any()}
+    assert len(held) == 2
+    assert not held & blank
+    trainer = Trainer(new_avatar(toy, load_training_frames(toy), config), frames)
+    refining = refiner.Refiner(toy, frames, held, trainer)
+    refining.advance(0.5)
+    for frame in frames[:3]:
+        refining(frame)
+    sigma = refining.space.sigma
+    for correction, _ in refining.known.values():
+        assert (np.abs(correction) <= 6 * sigma).all()
+    json.dumps(refining.record(), allow_nan=False)
 
 
 def test_what_can_not_be_is_refused_before_the_work(toy, small_config, tmp_path):

@@ -79,11 +79,6 @@ def middle_of(vertices: np.ndarray, weights: np.ndarray) -> np.ndarray:
     return (weights[:, None] * vertices.astype(np.float64)).sum(0) / max(float(weights.sum()), 1e-9)
 
 
-def posed_by(collection: Collection, clip: Clip) -> bool:
-    """Whether a clip's meshes come from its expression, so that this can be corrected."""
-    return clip.vertices is None
-
-
 def mesh_changes(collection: Collection, clip: Clip, row: int, space: Space) -> np.ndarray:
     """Metres [K, V, 3] that the mesh of a frame moves a unit of each expression in `space`."""
     count = len(space.rows)

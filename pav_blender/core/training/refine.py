@@ -91,6 +91,8 @@ def correct(
     """
     free = len(space) if changes is not None and len(changes) else RIGID
     current = start.copy()
+    if not len(sight.columns):
+        return start
     precision = _precision(space, sight.camera)
     best, least = current, np.inf
     jacobian = hit = None

@@ -56,7 +56,8 @@ def kept_out(collection: Collection, frames: list[Frame]) -> set[str]:
     """Names of the training frames to judge by, spread over each clip."""
     names: set[str] = set()
     for clip in collection.clips:
-        own = [f.name for f in frames if f.name.rpartition("/")[0] == clip.name]
+        own = [f for f in frames if f.name.rpartition("/")[0] == clip.name]
+        own = [f.name for f in own if _is_person(f.rgba).any()]
         if len(own) >= _FEWEST:
             count = min(max(1, len(own) // _KEPT_OUT), _MOST_KEPT_OUT)
             at = (np.arange(count) + 0.5) * len(own) / count
@@ -241,14 +242,20 @@ class Refiner:
         return out
 
 
+def _is_person(rgba: np.ndarray) -> np.ndarray:
+    return rgba[..., 3] > 127
+
+
 def _length(vectors: np.ndarray) -> float:
     return float(np.linalg.norm(vectors, axis=1).mean())
 
 
 def _head_pixels(frame: Frame, blocks: np.ndarray, random: np.random.Generator) -> Sight:
     """Some of the person's pixels in blocks [h, w] bool, drawn evenly."""
-    rows, columns = np.nonzero(frame.rgba[..., 3] > 127)
+    rows, columns = np.nonzero(_is_person(frame.rgba))
     inside = np.flatnonzero(blocks[rows // _BLOCK, columns // _BLOCK])
+    if not len(inside):  # a person of a block or less
+        inside = np.arange(len(rows))
     chosen = np.sort(random.permutation(inside)[: 2 * _PIXELS])
     colours = frame.rgba[rows[chosen], columns[chosen]].astype(np.float64) / 255
     colours[:, :3] *= colours[:, 3:]
