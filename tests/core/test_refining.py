@@ -226,8 +226,8 @@ def test_what_is_kept_is_what_helps():
         return verdict.kept
 
     assert decided(None, None, None) == OFF
-    assert decided(25.0, 25.05, 25.09) == OFF
-    assert decided(25.0, 26.0, 26.05) == POSE
+    assert decided(25.0, 25.22, 25.25) == OFF
+    assert decided(25.0, 26.0, 26.2) == POSE
     assert decided(25.0, 26.0, None) == POSE
     assert decided(25.0, 26.0, 27.0) == EXPRESSION
     assert decided(25.0, 24.0, 24.5) == OFF

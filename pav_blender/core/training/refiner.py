@@ -27,7 +27,7 @@ ROUNDS = (0.4, 0.7)  # parts of the schedule; pictures are whole from the first 
 _KEPT_OUT = 12  # one training frame in so many is kept out to judge by,
 _MOST_KEPT_OUT = 4  # of a clip
 _FEWEST = 4  # training frames of a clip; of fewer none can be spared
-_GAIN = 0.1  # dB that a kind of correction must be worth
+_GAIN = 0.3  # dB that a kind of correction must be worth; right tracks gain less, for nothing
 _PIXELS = 800
 _BLOCK = 16  # pixels: what lies side by side tells the same
 OFF, POSE, EXPRESSION = "off", "pose", "pose and expression"
@@ -56,8 +56,11 @@ def kept_out(collection: Collection, frames: list[Frame]) -> set[str]:
     """Names of the training frames to judge by, spread over each clip."""
     names: set[str] = set()
     for clip in collection.clips:
-        own = [f for f in frames if f.name.rpartition("/")[0] == clip.name]
-        own = [f.name for f in own if _is_person(f.rgba).any()]
+        own = [
+            frame.name
+            for frame in frames
+            if frame.name.rpartition("/")[0] == clip.name and _is_person(frame.rgba).any()
+        ]
         if len(own) >= _FEWEST:
             count = min(max(1, len(own) // _KEPT_OUT), _MOST_KEPT_OUT)
             at = (np.arange(count) + 0.5) * len(own) / count
