@@ -49,7 +49,7 @@ def run(options: Options, progress: Report | None = None) -> tuple[dict[str, Any
         for size in SIZES:
             videos = films(person, folder / f"seed{seed}_{size}", size)
             found, seconds = _tracked(videos, size, options, person)
-            rows.append({"seed": seed, "size": size, **_row(person, found, seconds)})
+            rows.append({"seed": seed, "size": size, **_row(person, found, seconds, size)})
     show(rows)
     steps = _ablation(people[0], folder / f"seed{SEEDS[0]}_{SIZES[0]}", options, progress)
     show(steps)
@@ -141,8 +141,8 @@ def _tracked(
     return found, seconds / sum(len(clip) for clip in person.clips)
 
 
-def _row(person: Collection, found: Collection, seconds: float) -> dict[str, Any]:
-    errors = compare(person, found)
+def _row(person: Collection, found: Collection, seconds: float, size: int) -> dict[str, Any]:
+    errors = compare(person, found, size=size)
     return {**_short(errors), "seconds_a_frame": round(seconds, 3)}
 
 
@@ -175,7 +175,7 @@ def _ablation(
     )
     for name, photo in (("landmarks, one shape", False), ("and pictures", True)):
         found, took = _tracked(videos, max(SIZES), options, person, photo=photo)
-        kinds.append((name, found, _row(person, found, took)))
+        kinds.append((name, found, _row(person, found, took, max(SIZES))))
     rows = []
     for number, (name, found, fields) in enumerate(kinds):
         fields |= _avatar(found, folder / f"ablation{number}.pav", None, progress)

@@ -76,6 +76,17 @@ def test_trembling_is_counted_against_the_truths_own(truth):
     assert errors.jitter > 1.5
 
 
+def test_frames_may_have_been_filmed_smaller(truth):
+    """The same track, its focal length told in the pixels of frames half as wide."""
+    found = _found(truth)
+    found.extra["tracking"]["clips"][0]["focal_pixels"] /= 2
+    half = compare(truth, found, size=truth.clips[0].width // 2)
+    assert half.reprojection_px < 1e-3
+    assert half.focal_percent < 1e-4
+    assert half.jitter == pytest.approx(1, abs=1e-4)
+    assert compare(truth, found).reprojection_px > 1
+
+
 def test_what_cannot_be_compared_is_said(truth):
     with pytest.raises(InputError, match="focal length"):
         compare(truth, replace(truth, extra={}))

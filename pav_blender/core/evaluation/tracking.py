@@ -50,11 +50,12 @@ class _Both:
     focal: tuple[float, float]  # of the source frame's pixels
 
 
-def compare(truth: Collection, found: Collection) -> TrackErrors:
+def compare(truth: Collection, found: Collection, *, size: int | None = None) -> TrackErrors:
     """Errors of `found`, tracked on the pictures of `truth`'s clips, name for name.
 
-    Both are of one head model, the source frames have the size of the truth's pictures, and
-    `found` says each clip's focal length in source pixels, as `track` does. Raises InputError.
+    Both are of one head model; size: the source frames' side in pixels, where the truth's pictures
+    were resized (default: their own); `found` says each clip's focal length in source pixels, as
+    `track` does. Raises InputError.
     """
     if truth.head.fingerprint != found.head.fingerprint:
         raise InputError(f"{found.path}: tracked with another head than {truth.path}")
@@ -64,7 +65,7 @@ def compare(truth: Collection, found: Collection) -> TrackErrors:
     )
     lay = _rigid(neutral[1], neutral[0])
     laid = neutral[1] @ lay[0].T + lay[1]
-    clips = [_both(truth, found, clip.name, face) for clip in found.clips]
+    clips = [_both(truth, found, clip.name, face, size) for clip in found.clips]
     reprojection = np.concatenate([_apart(*both.pixels) for both in clips])
     rotation = np.concatenate([_angles(*both.turns) for both in clips])
     expression, whole, jitters = [], [], []
@@ -89,7 +90,9 @@ def compare(truth: Collection, found: Collection) -> TrackErrors:
     )
 
 
-def _both(truth: Collection, found: Collection, name: str, face: np.ndarray) -> _Both:
+def _both(
+    truth: Collection, found: Collection, name: str, face: np.ndarray, size: int | None
+) -> _Both:
     focal = next(
         (c["focal_pixels"] for c in found.extra.get("tracking", {}).get("clips", [])
          if c["name"] == name),
@@ -101,12 +104,15 @@ def _both(truth: Collection, found: Collection, name: str, face: np.ndarray) -> 
     _, a, b = np.intersect1d(real.frame_id, seen.frame_id, return_indices=True)
     if len(a) == 0:
         raise InputError(f"{found.path}: clip {name} shares no frame with {truth.path}")
+    scale = 1.0 if size is None else size / real.width
+    centre = scale * np.array([real.width / 2, real.height / 2])
+    true_focal = scale * float(real.intrinsics[0, 0, 0])
     sides = (
-        _seen(truth, real, a, face, float(real.intrinsics[0, 0, 0]), real),
-        _seen(found, seen, b, face, float(focal), real),
+        _seen(truth, real, a, face, true_focal, centre),
+        _seen(found, seen, b, face, float(focal), centre),
     )
     pixels, local, turns = zip(*sides, strict=True)
-    return _Both(pixels, local, turns, real.frame_id[a], (float(real.intrinsics[0, 0, 0]), focal))
+    return _Both(pixels, local, turns, real.frame_id[a], (true_focal, float(focal)))
 
 
 def _seen(
@@ -115,13 +121,12 @@ def _seen(
     rows: np.ndarray,
     face: np.ndarray,
     focal: float,
-    source: Clip,
+    centre: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pixels [F,V,2] of the source frame, places [F,V,3] in the head's frame, turns [F,3,3]."""
     vertices = collection.posed(clip, rows).astype(np.float64)
     to_camera = np.linalg.inv(clip.camera_to_world[rows].astype(np.float64))
     own = np.einsum("fij,fvj->fvi", to_camera[:, :3, :3], vertices) + to_camera[:, None, :3, 3]
-    centre = np.array([source.width / 2, source.height / 2])
     pixels = own[:, face, :2] / own[:, face, 2:] * focal + centre
     pose = clip.pose[rows].astype(np.float64)
     head = rotations(pose[:, 0])
