@@ -215,9 +215,8 @@ def _joined(parts: list[Collection], out: Path) -> Collection:
             clip = part.clips[0]
             vertices = part.posed(clip, np.arange(len(clip)))
             writer.clip(dataclasses.replace(clip, vertices=vertices))
-            for row in range(len(clip)):
-                rgba = read_rgba(part.image_path(clip, row))
-                writer.image(clip.name, int(clip.frame_id[row]), rgba)
+            images = f"clips/{clip.name}/images"
+            shutil.copytree(part.path / images, writer.root / images)
     return read_collection(out)
 
 

@@ -46,9 +46,9 @@ def export_animated(
             f"--to {kind}: this Blender was built without {kind.upper()}, as some distributions' "
             "are; use one from blender.org, or `pip install bpy`"
         )
-    from .scene import _rows
+    from .scene import filmed_rows
 
-    rows = _rows(clip)
+    rows = filmed_rows(clip)
     numbers = clip.frame_id[rows]
     first, last = int(numbers[0]), int(numbers[-1])
     if last - first > _LONGEST:
@@ -71,13 +71,13 @@ def export_animated(
 def _settings(clip: Clip, first: int, last: int, fps: float) -> Any:
     import bpy
 
-    from .scene import _rate
+    from .scene import frame_rate
 
     scene = bpy.context.scene
     scene.frame_start, scene.frame_end = first, last
     scene.render.resolution_x, scene.render.resolution_y = clip.width, clip.height
     scene.render.resolution_percentage = 100
-    scene.render.fps, scene.render.fps_base = _rate(fps)
+    scene.render.fps, scene.render.fps_base = frame_rate(fps)
     return scene
 
 

@@ -16,6 +16,11 @@ QUALITIES = (
     ("REFERENCE", "Reference", "As fine as training; slow"),
 )
 
+# Blender 4.5 and later ask which paths may begin with "//"; earlier ones do not know the option
+_RELATIVE = {"ANIMATABLE"}
+if bpy.app.version >= (4, 5):
+    _RELATIVE.add("PATH_SUPPORTS_BLEND_RELATIVE")
+
 # Blender keeps pointers to the strings of a dynamic enum: they must stay alive here
 _items: dict[tuple[str, ...], list[tuple[str, str, str, int]]] = {}
 
@@ -64,6 +69,7 @@ class PavObject(bpy.types.PropertyGroup):
         name="Avatar",
         description="Avatar file (.pav) that this head is rendered as",
         subtype="FILE_PATH",
+        options=_RELATIVE,
         override={"LIBRARY_OVERRIDABLE"},
         update=_avatar_chosen,
     )

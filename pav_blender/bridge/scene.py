@@ -102,7 +102,7 @@ def import_track(mesh: Any, collection: Any, clip_name: str, fps: float | None =
             f"object {mesh.name!r} has no {what}: clip {clip_name!r} moves the head "
             f"{collection.head_name!r}; import that clip's avatar first"
         )
-    rows = _rows(clip)
+    rows = filmed_rows(clip)
     frames = clip.frame_id[rows].astype(np.float64)
     motion = Motion(clip.expression[rows], clip.pose[rows], clip.translation[rows], frames)
     apply_motion(mesh, armature, head.expression_names, head.joint_names, motion)
@@ -117,7 +117,7 @@ def import_track(mesh: Any, collection: Any, clip_name: str, fps: float | None =
     render.pixel_aspect_x, render.pixel_aspect_y = lenses[0].aspect_x, lenses[0].aspect_y
     scene.frame_start, scene.frame_end = int(frames[0]), int(frames[-1])
     if fps is not None:
-        render.fps, render.fps_base = _rate(fps)
+        render.fps, render.fps_base = frame_rate(fps)
     first = collection.image_path(clip, int(rows[0]))
     backdrop.show_pictures(camera, first.parent, clip.frame_id[rows])
     for image in backdrop.pictures_of(camera):
@@ -164,7 +164,7 @@ def build_scene(
     return SceneObjects(rig.mesh, rig.armature, camera)
 
 
-def _rows(clip: Any) -> np.ndarray:
+def filmed_rows(clip: Any) -> np.ndarray:
     """Rows of the clip's own camera by rising frame number; all, where there are no others."""
     rows = clip.indices("train", "test")
     if len(rows) == 0:
@@ -187,7 +187,7 @@ def _track_camera(scene: Any, mesh: Any) -> Any:
     return camera
 
 
-def _rate(fps: float) -> tuple[int, float]:
+def frame_rate(fps: float) -> tuple[int, float]:
     """Blender's whole rate and its divisor, as 29.97 = 30 / 1.001."""
     whole = max(1, round(fps))
     return whole, whole / fps
@@ -223,7 +223,7 @@ def run(args: argparse.Namespace) -> int:
             args.avatar, collection, clip.name, appearance=args.appearance, fps=args.fps
         )
         made.mesh.pav.avatar = stored_path(args.avatar, str(args.out))
-        first = collection.image_path(clip, int(_rows(clip)[0]))
+        first = collection.image_path(clip, int(filmed_rows(clip)[0]))
         for image in backdrop.pictures_of(made.camera):
             image.filepath = stored_path(first, str(args.out))
         _scene().render.filepath = f"//{args.out.stem}/"

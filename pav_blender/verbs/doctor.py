@@ -64,7 +64,7 @@ def versions() -> dict[str, str]:
 
 def machine() -> dict[str, object]:
     """Processor, system and cores in use."""
-    from ..core.kernels.cpu.threads import threads
+    from ..core.cores import threads
 
     return {
         "system": f"{platform.system()} {platform.machine()}",

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import pickle
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +17,7 @@ from flame_fixture import (
     write_companions,
     write_model,
 )
+from formats_files import obj_text, opaque, ply_bytes, rewrite_json, save_frame, write_json
 from scipy.spatial.transform import Rotation
 from takes import FRAMES, INSTA_CODES, PARSING_CODES, Take, coded, looking_cv, sixes, take
 
@@ -27,33 +26,17 @@ from pav_blender.core.images import write_gray, write_rgba
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
-__all__ = ["FRAMES", "flame", "posed", "write_companions", "write_model"]
-
-
-def save_frame(path: Path, content: dict) -> None:
-    """What `torch.save` writes of a dict of numpy arrays: a zip with one pickle in it."""
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("archive/data.pkl", pickle.dumps(content, protocol=2))
-        archive.writestr("archive/version", "3\n")
-
-
-def obj_text(vertices: np.ndarray) -> str:
-    """As INSTA's meshes: 8090 faces, so that some vertices belong to none."""
-    faces = flame().arrays["f"].astype(int)[:8090] + 1
-    lines = [f"v {x:.8f} {y:.8f} {z:.8f}" for x, y, z in vertices]
-    return "\n".join([*lines, *(f"f {a} {b} {c}" for a, b, c in faces)]) + "\n"
-
-
-def ply_bytes(vertices: np.ndarray) -> bytes:
-    faces = flame().arrays["f"].astype(int)
-    header = (
-        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n"
-        "property float x\nproperty float y\nproperty float z\n"
-        f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
-    )
-    rows = np.zeros(len(faces), [("n", "u1"), ("v", "<i4", 3)])
-    rows["n"], rows["v"] = 3, faces
-    return header.encode() + vertices.astype("<f4").tobytes() + rows.tobytes()
+__all__ = [
+    "FRAMES",
+    "flame",
+    "obj_text",
+    "ply_bytes",
+    "posed",
+    "rewrite_json",
+    "save_frame",
+    "write_companions",
+    "write_model",
+]
 
 
 def lid_offset(lids: np.ndarray) -> np.ndarray:
@@ -67,6 +50,13 @@ CANONICAL_TURNS = np.stack(
 
 
 # ---- the formats
+
+
+def begun(path: Path, folders: tuple[str, ...], act: Take) -> tuple[Take, int]:
+    """Makes the folders of a format; the take and how many frames it has."""
+    for folder in folders:
+        (path / folder).mkdir(parents=True)
+    return act, len(act)
 
 
 def metrical_frame(act: Take, frame: int) -> tuple[dict, np.ndarray, np.ndarray]:
@@ -114,17 +104,18 @@ def write_metrical(
     act: Take | None = None,
 ) -> Take:
     """matte: a folder of a user's own beside it, for the tracker writes none."""
-    act = act or take(seed, frames)
-    frames = len(act)
-    for folder in ("checkpoint", "input", "mesh", "depth", *(["matte"] if matte else [])):
-        (path / folder).mkdir(parents=True)
+    act, frames = begun(
+        path,
+        ("checkpoint", "input", "mesh", "depth", *(["matte"] if matte else [])),
+        act or take(seed, frames),
+    )
     for frame in range(frames):
         content, vertices, world = metrical_frame(act, frame)
         save_frame(path / f"checkpoint/{frame:05d}.frame", content)
         pixels, depth = project_cv(vertices, world, act.lens)
         act.truth[frame] = pixels
         rgba = act.picture(frame, pixels, depth)
-        write_rgba(path / f"input/{frame:05d}.png", _opaque(rgba, 70))
+        write_rgba(path / f"input/{frame:05d}.png", opaque(rgba, 70))
         if matte:
             write_gray(path / f"matte/{frame:05d}.png", rgba[..., 3])
         if meshes:
@@ -140,10 +131,7 @@ def write_flashavatar(
     act: Take | None = None,
 ) -> Take:
     """Its pictures are numbered from 1, the checkpoints from 0."""
-    act = act or take(seed, frames)
-    frames = len(act)
-    for folder in ("checkpoint", "imgs", "alpha", "parsing"):
-        (path / folder).mkdir(parents=True)
+    act, frames = begun(path, ("checkpoint", "imgs", "alpha", "parsing"), act or take(seed, frames))
     act.truth = {}
     for frame in range(frames):
         content, vertices, world = metrical_frame(act, frame)
@@ -151,7 +139,7 @@ def write_flashavatar(
         pixels, depth = project_cv(vertices, world, act.lens)
         act.truth[frame] = pixels
         rgba = act.picture(frame, pixels, depth)
-        write_rgba(path / f"imgs/{frame + 1:05d}.png", _opaque(rgba, 90))
+        write_rgba(path / f"imgs/{frame + 1:05d}.png", opaque(rgba, 90))
         write_gray(path / f"alpha/{frame + 1:05d}.png", rgba[..., 3])
         inside = (rgba[..., 3] > 127).astype(np.uint8) * 255
         mouth = np.zeros_like(inside)
@@ -172,10 +160,9 @@ def write_insta(
     act: Take | None = None,
     canonical: bool = True,
 ) -> Take:
-    act = act or take(seed, frames)
-    frames = len(act)
-    for folder in ("images", "seg_mask", "meshes", "flame/exp"):
-        (path / folder).mkdir(parents=True)
+    act, frames = begun(
+        path, ("images", "seg_mask", "meshes", "flame/exp"), act or take(seed, frames)
+    )
     fx, fy, cx, cy = act.lens
     height, width = act.size
     top = {"w": float(width), "h": float(height), "cx": cx, "cy": cy, "fl_x": fx, "fl_y": fy}
@@ -290,10 +277,7 @@ def write_vhap(
     frames: int = FRAMES,
     act: Take | None = None,
 ) -> Take:
-    act = act or take(seed, frames)
-    frames = len(act)
-    for folder in ("images", "fg_masks", "flame_param"):
-        (path / folder).mkdir(parents=True)
+    act, frames = begun(path, ("images", "fg_masks", "flame_param"), act or take(seed, frames))
     fx, fy, cx, cy = act.lens
     entries = []
     for frame in range(frames):
@@ -307,7 +291,7 @@ def write_vhap(
             act.truth[1000 * camera + frame] = pixels
             name = f"{frame:05d}_{camera:02d}.png"
             rgba = act.picture(frame, pixels, depth)
-            write_rgba(path / f"images/{name}", _opaque(rgba, 255))
+            write_rgba(path / f"images/{name}", opaque(rgba, 255))
             write_gray(path / f"fg_masks/{name}", rgba[..., 3])
             entries.append(
                 {
@@ -372,10 +356,7 @@ def write_vhap_track(
     act: Take | None = None,
 ) -> Take:
     """The tracker's own file: frames stacked, a focal length relative to the longer side."""
-    act = act or take(seed, frames)
-    frames = len(act)
-    for folder in ("images", "alpha_maps", "run"):
-        (path / folder).mkdir(parents=True)
+    act, frames = begun(path, ("images", "alpha_maps", "run"), act or take(seed, frames))
     to_world = np.eye(4)
     to_world[2, 3] = 1
     height, width = act.size
@@ -393,7 +374,7 @@ def write_vhap_track(
         pixels, depth = project_gl(vertices, np.linalg.inv(to_world), centred)
         act.truth[frame] = pixels
         rgba = act.picture(frame, pixels, depth)
-        write_rgba(path / f"images/{frame:05d}.png", _opaque(rgba, 200))
+        write_rgba(path / f"images/{frame:05d}.png", opaque(rgba, 200))
         write_gray(path / f"alpha_maps/{frame:05d}.png", rgba[..., 3])
     stacked = {
         key: np.concatenate([row[key] for row in rows])
@@ -446,7 +427,7 @@ def write_imavatar(
         act.truth[frame + 1] = pixels
         name = str(frame + 1)
         rgba = act.picture(frame, pixels, -z / 4, (side, side))
-        write_rgba(path / f"image/{name}.png", _opaque(rgba, 120))
+        write_rgba(path / f"image/{name}.png", opaque(rgba, 120))
         write_gray(path / f"mask/{name}.png", rgba[..., 3])
         semantic = np.where(rgba[..., 3] > 127, 1, 0).astype(np.uint8)
         semantic[: side // 3] *= 17
@@ -486,22 +467,3 @@ def write_nerface(path: Path) -> None:
     }
     content = {"camera_angle_x": 0.3, "intrinsics": [1, 1, 0.5, 0.5], "frames": [frame]}
     write_json(path / "transforms_train.json", content)
-
-
-def _opaque(rgba: np.ndarray, background: int) -> np.ndarray:
-    """The picture laid over a plain grey, without alpha."""
-    part = rgba[..., 3:].astype(np.float64) / 255
-    colour = rgba[..., :3] * part + background * (1 - part)
-    full = np.full_like(part, 255)
-    return np.round(np.concatenate([colour, full], 2)).astype(np.uint8)
-
-
-def write_json(path: Path, content: dict) -> None:
-    path.write_text(json.dumps(content))
-
-
-def rewrite_json(path: Path, change) -> None:
-    """Lets `change` alter a JSON file's content in place."""
-    content = json.loads(path.read_text())
-    change(content)
-    path.write_text(json.dumps(content))

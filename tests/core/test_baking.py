@@ -11,11 +11,11 @@ from scipy.spatial import cKDTree
 from pav_blender.cli import main
 from pav_blender.core.baking import bake, compare, surface, write_glb
 from pav_blender.core.baking.bake import neutral_scene
-from pav_blender.core.baking.geometry import vertex_normals
 from pav_blender.core.baking.texture import sample, unwrap
 from pav_blender.core.baking.views import camera_at
 from pav_blender.core.errors import InputError
 from pav_blender.core.field.avatar import head_of
+from pav_blender.core.head.geometry import vertex_normals
 from pav_blender.core.rendering.rasterise import cover
 
 pytest.importorskip("xatlas")

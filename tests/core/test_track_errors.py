@@ -6,10 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pav_blender.benchmarks.track import claims
+from pav_blender.benchmarks.track import claims, film
 from pav_blender.core.collection import read_collection
 from pav_blender.core.errors import InputError
 from pav_blender.core.evaluation.tracking import compare
+from pav_blender.core.images import read_rgba
+from pav_blender.core.tracking.decode import open_video
 from pav_blender.core.tracking.landmark_model import axis_angles, rotations
 
 STUDIO = Path(__file__).parents[2] / "data" / "studio3"
@@ -93,6 +95,18 @@ def test_what_cannot_be_compared_is_said(truth):
     numbers = truth.clips[0].frame_id + 1000
     with pytest.raises(InputError, match="shares no frame"):
         compare(truth, _found(truth, frame_id=numbers))
+
+
+def test_a_film_shows_the_clip_before_a_room(truth, tmp_path):
+    clip = truth.clips[0]
+    frames = list(open_video(film(truth, clip, tmp_path / "a.mp4", 128, seed=3)).frames())
+    assert len(frames) == len(clip)
+    rgba = read_rgba(truth.image_path(clip, 5)).reshape(128, 2, 128, 2, 4).mean(axis=(1, 3))
+    shown = frames[5].rgb.astype(float)
+    assert shown.shape == (128, 128, 3)
+    inside, outside = rgba[..., 3] == 255, rgba[..., 3] == 0
+    assert np.abs(shown - rgba[..., :3])[inside].mean() < 8
+    assert shown[outside].min() > 20  # a room, not the black of hidden pixels
 
 
 def test_a_bad_track_meets_no_claim():

@@ -110,7 +110,7 @@ def test_the_face_looks_more_alike_where_the_head_truly_is(filmed):
     def unlike(fit):
         term = Photo(points, _windows(seen, pictures))
         term.look(betas, fit)
-        residual, _, inside = term._residual(betas, fit)
+        residual, inside = term.residual(betas, fit)
         return np.median(np.abs(residual[(term.seen > 0.5) & inside]))
 
     assert unlike(truth) < 0.8 * unlike(_turned_wrong(truth, 1.5))

@@ -15,8 +15,9 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
 from pav_blender.core.errors import PavError
+from pav_blender.core.head.geometry import vertex_normals
 from pav_blender.core.head.model import HeadModel
-from tools.builtin_head.picture import View, draw, vertex_normals
+from tools.builtin_head.picture import View, draw
 
 COUNT = 478
 _SKIN = 468  # the rest are irises: centre, then four points round it; right eye first

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
+from pav_blender.core.head.geometry import vertex_normals
 from pav_blender.core.head.model import HeadModel
 
 _SKIN = np.array([0.78, 0.58, 0.48])
@@ -78,15 +79,6 @@ def rasterise(points, triangles, size):  # pragma: no cover - compiled
                     weights[y, x, 1] = v
                     weights[y, x, 2] = w
     return depth, index, weights
-
-
-def vertex_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    corners = vertices[triangles]
-    face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals = np.zeros_like(vertices)
-    for corner in range(3):
-        np.add.at(normals, triangles[:, corner], face)
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
 
 
 def draw(

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from pav_blender.core.baking.geometry import vertex_normals
 from pav_blender.core.collection import Clip, CollectionWriter
 from pav_blender.core.head import load_head
+from pav_blender.core.head.geometry import vertex_normals
 from pav_blender.core.rendering.cameras import Camera
 from pav_blender.core.rendering.rasterise import rasterise
 

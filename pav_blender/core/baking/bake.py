@@ -9,9 +9,9 @@ import torch
 
 from ..errors import InputError
 from ..field.avatar import Avatar, head_of
+from ..head.geometry import vertex_normals
 from ..progress import Report
 from ..rendering.render import Scene, pose_scene
-from .geometry import vertex_normals
 from .surface import surface
 from .texture import paint, unwrap
 

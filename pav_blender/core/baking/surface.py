@@ -17,11 +17,11 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from ..errors import InputError, PavError
+from ..head.geometry import vertex_normals
 from ..progress import Report
 from ..rendering.cameras import Camera
 from ..rendering.rays import RayBatch
 from ..rendering.render import RenderSettings, Scene, trace_rays
-from .geometry import vertex_normals
 from .views import camera_at, field_picture
 
 # rays end where this is left: hair is seen where it begins, not at its mean depth, and fog that

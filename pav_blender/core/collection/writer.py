@@ -146,7 +146,7 @@ class CollectionWriter:
         folder = self.root / "clips" / clip.name
         folder.mkdir(parents=True, exist_ok=True)
         with replacing(folder / "frames.npz") as temporary, open(temporary, "wb") as stream:
-            np.savez_compressed(stream, allow_pickle=False, **arrays)
+            np.savez_compressed(stream, **arrays)
         self._meta["clips"].append(
             {
                 "name": clip.name,

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from ..collection import Clip, Collection
+from ..deformation.rigid import head_rotation
 from ..errors import InputError
 from ..tracking.landmark_model import rotations
 
@@ -63,17 +64,18 @@ def compare(truth: Collection, found: Collection, *, size: int | None = None) ->
     neutral = tuple(
         _head_frame(c.head, c.head.shaped(c.betas), c.betas)[face] for c in (truth, found)
     )
-    lay = _rigid(neutral[1], neutral[0])
-    laid = neutral[1] @ lay[0].T + lay[1]
+    turn = head_rotation(neutral[1], neutral[0], np.ones(len(face)))
+    shift = neutral[0].mean(axis=0) - turn @ neutral[1].mean(axis=0)
+    laid = neutral[1] @ turn.T + shift
     clips = [_both(truth, found, clip.name, face, size) for clip in found.clips]
     reprojection = np.concatenate([_apart(*both.pixels) for both in clips])
     rotation = np.concatenate([_angles(*both.turns) for both in clips])
     expression, whole, jitters = [], [], []
     for both in clips:
         real, seen = both.local
-        moved = np.linalg.norm((real - neutral[0]) - (seen - neutral[1]) @ lay[0].T, axis=2)
+        moved = np.linalg.norm((real - neutral[0]) - (seen - neutral[1]) @ turn.T, axis=2)
         expression.append(moved.mean(axis=1))
-        whole.append(np.linalg.norm(seen @ lay[0].T + lay[1] - real, axis=2).mean(axis=1))
+        whole.append(np.linalg.norm(seen @ turn.T + shift - real, axis=2).mean(axis=1))
         jitters.append([_shake(pixels, both.numbers) for pixels in both.pixels])
     shaken = np.array(jitters).sum(axis=0)
     return TrackErrors(
@@ -168,12 +170,3 @@ def _shake(pixels: np.ndarray, numbers: np.ndarray) -> float:
     even = np.flatnonzero((np.diff(numbers)[:-1] == 1) & (np.diff(numbers)[1:] == 1)) + 1
     bends = pixels[even - 1] - 2 * pixels[even] + pixels[even + 1]
     return float(np.linalg.norm(bends, axis=2).mean(axis=1).sum())
-
-
-def _rigid(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The turn [3,3] and shift [3] that lay source [V,3] on target best (Kabsch)."""
-    a, b = source.mean(axis=0), target.mean(axis=0)
-    left, _, right = np.linalg.svd((target - b).T @ (source - a))
-    flip = np.diag([1, 1, np.sign(np.linalg.det(left @ right))])
-    turn = left @ flip @ right
-    return turn, b - turn @ a

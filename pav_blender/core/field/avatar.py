@@ -75,7 +75,7 @@ class Avatar:
             config,
             len(appearances),
             len(expression_names),
-            torch.from_numpy(np.ascontiguousarray(triangles, np.int32)),
+            torch.from_numpy(np.array(triangles, np.int32, order="C")),
             corner_uvs,
             len(canonical_vertices),
         )

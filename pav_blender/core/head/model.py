@@ -92,7 +92,7 @@ class HeadModel:
             _tensor(argument, device, dtype) for argument in arguments
         )
         self._check_parameters(betas.shape, expression.shape, pose.shape, translation.shape)
-        tensors = self._tensors(device, dtype)
+        tensors = self.tensors(device, dtype)
         if offset is not None:
             tensors = {**tensors, "template": tensors["template"] + _tensor(offset, device, dtype)}
         return pose_vertices(tensors, betas, expression, pose, translation)
@@ -127,13 +127,18 @@ class HeadModel:
 
         Heads without a joint called "jaw" stay neutral.
         """
-        pose = np.zeros((1, len(self.joint_names), 3), np.float32)
-        if "jaw" in self.joint_names:
-            pose[0, self.joint_names.index("jaw"), 0] = math.radians(CANONICAL_JAW_DEGREES)
         betas = _vector(betas, len(self.shape_basis), "identity")
         expression = np.zeros((1, len(self.expression_names)), np.float32)
         with torch.no_grad():
-            return self.pose(betas, expression, pose, np.zeros((1, 3), np.float32))[0].numpy()
+            still = np.zeros((1, 3), np.float32)
+            return self.pose(betas, expression, self.canonical_pose(), still)[0].numpy()
+
+    def canonical_pose(self) -> np.ndarray:
+        """The jaw, if there is one, open by 12 degrees: [1,J,3] float32."""
+        pose = np.zeros((1, len(self.joint_names), 3), np.float32)
+        if "jaw" in self.joint_names:
+            pose[0, self.joint_names.index("jaw"), 0] = math.radians(CANONICAL_JAW_DEGREES)
+        return pose
 
     def landmarks(self, vertices):
         """Landmark positions [...,L,3] on vertices [...,V,3] (array or tensor, differentiable)."""
@@ -158,7 +163,7 @@ class HeadModel:
     def _tensor_cache(self) -> dict:
         return {}
 
-    def _tensors(self, device: torch.device, dtype: torch.dtype) -> dict[str, torch.Tensor]:
+    def tensors(self, device: torch.device, dtype: torch.dtype) -> dict[str, torch.Tensor]:
         key = (str(device), dtype)
         if key not in self._tensor_cache:
             tensors = {

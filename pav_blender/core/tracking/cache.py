@@ -58,7 +58,7 @@ class Cache:
         path = self._folder / key / f"{name}.npz"
         try:
             with replacing(path) as temporary, open(temporary, "wb") as stream:
-                np.savez(stream, allow_pickle=False, **arrays)
+                np.savez(stream, **arrays)
         except OSError as error:
             raise InputError(f"{path}: cannot write there: {error.strerror}") from error
 

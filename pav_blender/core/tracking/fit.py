@@ -143,6 +143,7 @@ def refine_head(
     for level, (sigma, steps) in enumerate(_PHOTO_LEVELS):
         for photo, whole in zip(photos, pictures, strict=True):
             photo.pictures = whole.blurred(sigma) if sigma else whole
+            photo.front = None
         tell_level = _level(tell, level)
         state = _descend(problem, state, steps, tell_level, should_stop, look)
     return _finished(state, firm, seen)

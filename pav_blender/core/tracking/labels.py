@@ -41,13 +41,21 @@ _DARKER = 0.4  # of the skin's brightness: a beard, not a shadow
 _SPREAD = 12.0  # of 255: two colours as near as this are one
 
 
-def label(head: HeadModel, betas: np.ndarray, clip: Clip, row: int, rgba: np.ndarray) -> np.ndarray:
-    """uint8 [H, W], indices into LABELS, of a picture [H, W, 4] uint8 and its fitted head."""
+def label(
+    head: HeadModel,
+    parts: np.ndarray,
+    betas: np.ndarray,
+    clip: Clip,
+    row: int,
+    rgba: np.ndarray,
+) -> np.ndarray:
+    """uint8 [H, W], indices into LABELS, of a picture [H, W, 4] uint8 and its fitted head; parts
+    [T]: see `of_triangles`."""
     one = slice(row, row + 1)
     posed = head.pose(betas, clip.expression[one], clip.pose[one], clip.translation[one])[0].numpy()
     camera = Camera(clip.width, clip.height, clip.intrinsics[row], clip.camera_to_world[row])
     _, triangle, _ = rasterise(posed, head.triangles, camera)
-    mesh = np.where(triangle >= 0, _of_triangles(head)[triangle.clip(0)], 0).astype(np.uint8)
+    mesh = np.where(triangle >= 0, parts[triangle.clip(0)], 0).astype(np.uint8)
     return from_mesh(mesh, rgba)
 
 
@@ -151,7 +159,7 @@ def _likely(samples: np.ndarray, colours: np.ndarray) -> np.ndarray:
     return -0.5 * (square + np.linalg.slogdet(covariance)[1])
 
 
-def _of_triangles(head: HeadModel) -> np.ndarray:
+def of_triangles(head: HeadModel) -> np.ndarray:
     """[T] the label of each triangle of the bare head."""
     vertex = np.zeros(head.vertex_count, int)
     rank = np.zeros(head.vertex_count, int)

@@ -15,6 +15,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..head import HeadModel, builtin_head
+from ..head.geometry import vertex_normals
 
 # where the detector sees the built-in head's landmarks: [478,3] metres from their places on the
 # surface, in the head's frame; see tools/measure_detector.py
@@ -35,6 +36,8 @@ RIGHT_IRIS = (468, 469, 470, 471, 472)
 LEFT_IRIS = (473, 474, 475, 476, 477)
 # forehead, temples, eye corners, bridge of the nose: they move with the skull
 RIGID = (10, 338, 297, 332, 284, 251, 109, 67, 103, 54, 21, 33, 133, 362, 263, 6, 168, 197)
+# their own surface turns inward
+_INWARD = (*LIPS, *RIGHT_LIDS, *LEFT_LIDS, *RIGHT_IRIS, *LEFT_IRIS)
 # upper lid, lower lid, outer corner, inner corner
 RIGHT_OPENING, LEFT_OPENING = (159, 145, 33, 133), (386, 374, 263, 362)
 
@@ -54,7 +57,7 @@ class PointModel:
     """L points on `head`, with the first `shapes` identity components.
 
     triangles [L], barycentrics [L,3]: where they are; offsets [L,3]: metres that they stand off
-    the neutral surface.
+    the neutral surface; forward: those that count as facing forward whatever their surface does.
     """
 
     def __init__(
@@ -64,8 +67,10 @@ class PointModel:
         triangles: np.ndarray,
         barycentrics: np.ndarray,
         offsets: np.ndarray | None = None,
+        forward: tuple[int, ...] = (),
     ) -> None:
         self.head = head
+        self.forward = list(forward)
         self.barycentrics = barycentrics.astype(np.float64)
         self.corners = corners = head.triangles[triangles]  # [L,3]
         mix = self.barycentrics
@@ -98,14 +103,9 @@ class PointModel:
     @cached_property
     def normals(self) -> np.ndarray:
         """Outward directions [L,3] of the neutral head at the points."""
-        head = self.head
-        vertices = head.template.astype(np.float64)
-        a, b, c = (vertices[head.triangles[:, i]] for i in range(3))
-        flat = np.cross(b - a, c - a)
-        summed = np.zeros_like(vertices)
-        for i in range(3):
-            np.add.at(summed, head.triangles[:, i], flat)
-        normals = (summed[self.corners] * self.barycentrics[..., None]).sum(axis=1)
+        corners = vertex_normals(self.head.template, self.head.triangles)[self.corners]
+        normals = (corners * self.barycentrics[..., None]).sum(axis=1)
+        normals[self.forward] = (0, 0, 1)
         return normals / np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-12)
 
     def facing(self, posed: Posed) -> np.ndarray:
@@ -222,14 +222,8 @@ class LandmarkModel(PointModel):
             head.landmark_triangles,
             head.landmark_barycentrics,
             np.load(OFFSETS_PATH, allow_pickle=False) if _is_builtin(head) else None,
+            _INWARD,
         )
-
-    @cached_property
-    def normals(self) -> np.ndarray:
-        """As a point's; but lips, lids and irises, whose own surface turns inward, face forward."""
-        normals = PointModel.normals.func(self)  # type: ignore[attr-defined]
-        normals[[*LIPS, *RIGHT_LIDS, *LEFT_LIDS, *RIGHT_IRIS, *LEFT_IRIS]] = (0, 0, 1)
-        return normals
 
 
 def _is_builtin(head: HeadModel) -> bool:

@@ -15,12 +15,13 @@ from scipy.ndimage import gaussian_filter, uniform_filter
 
 from ..head import HeadModel
 from ..kernels import cpu as _cpu  # first: it says where numba keeps compiled code
+from ..kernels.cpu.threads import run_chunks
 from ..rendering.cameras import Camera
 from ..rendering.rasterise import rasterise
 from .crop import resize
 from .landmark_model import PointModel
 
-from numba import njit, prange  # isort: skip
+from numba import njit  # isort: skip
 
 assert _cpu
 SIDE = 224  # of a face's window, pixels
@@ -115,19 +116,18 @@ def sample(
     """Features at pixels [f,L,2]: values [f,L], gradient a source pixel [f,L,2], inside [f,L]."""
     scale = pictures.scale[rows]
     at = (pixels - pictures.corners[rows][:, None]) * scale[:, None, None] - 0.5
-    values, gradient, inside = _sample(pictures.features[rows], np.ascontiguousarray(at))
+    features, at = pictures.features[rows], np.ascontiguousarray(at)
+    values, inside = np.zeros(at.shape[:2], np.float32), np.zeros(at.shape[:2], np.bool_)
+    gradient = np.zeros(at.shape, np.float32)
+    run_chunks(lambda i, j: _sample(features, at, values, gradient, inside, i, j), len(at), 4)
     return values * _STEP, gradient * (_STEP * scale[:, None, None]), inside
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _sample(features, at):  # type: ignore[no-untyped-def]
-    frames, count = at.shape[:2]
+@njit(cache=True, nogil=True)
+def _sample(features, at, values, gradient, inside, start, stop):  # type: ignore[no-untyped-def]
     side = features.shape[1]
-    values = np.zeros((frames, count), np.float32)
-    gradient = np.zeros((frames, count, 2), np.float32)
-    inside = np.zeros((frames, count), np.bool_)
-    for f in prange(frames):
-        for k in range(count):
+    for f in range(start, stop):
+        for k in range(at.shape[1]):
             x, y = at[f, k, 0], at[f, k, 1]
             if not (1 <= x < side - 2 and 1 <= y < side - 2):
                 continue
@@ -139,7 +139,6 @@ def _sample(features, at):  # type: ignore[no-untyped-def]
             gradient[f, k, 0] = (1 - v) * (b - a) + v * (d - c)
             gradient[f, k, 1] = (1 - u) * (c - a) + u * (d - b)
             inside[f, k] = True
-    return values, gradient, inside
 
 
 def templates(values: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

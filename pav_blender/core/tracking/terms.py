@@ -127,8 +127,8 @@ class Landmarks:
 class Photo:
     """A clip's pictures at points of the face, against what the clip shows there on the whole.
 
-    `shared` [L] is what all clips show there, NaN where they do not agree; `template` [L] is found
-    by `look`, which must precede the first use.
+    `template` [L] is that, and `certainty` [L] the weight behind it; `look` finds them, and what is
+    `seen` of the points, [F,L]. It must precede the first use.
     """
 
     model: PointModel
@@ -138,23 +138,28 @@ class Photo:
     certainty: np.ndarray | None = None
     weights: np.ndarray | None = None
     seen: np.ndarray | None = None
+    front: np.ndarray | None = (
+        None  # [F,L] nothing of the head hides it; kept, for it hardly changes
+    )
 
     def look(self, betas: np.ndarray, fit: ClipFit) -> None:
         """Finds what is visible, and each point's usual look over the frames."""
         posed = _posed(self.model, betas, fit)
         facing = ((self.model.facing(posed) - 0.2) / 0.5).clip(0, 1)
-        self.seen = facing * visible(self.model, betas, fit, posed.points, self.pictures)
+        if self.front is None:
+            self.front = visible(self.model, betas, fit, posed.points, self.pictures)
+        self.seen = facing * self.front
         values, _, inside = sample(self.pictures, project(posed.points, fit.focal))
         self.template, self.certainty = templates(values, self.seen * inside)
 
     def lean(self, shared: np.ndarray, share: float) -> None:
         """Moves the template by `share` toward `shared` [L], less where it differs much."""
         assert self.template is not None
-        apart = np.nan_to_num(shared - self.template)
+        apart = shared - self.template
         self.template = self.template + share * apart / (1 + (apart / 0.5) ** 2)
 
     def weigh(self, betas: np.ndarray, fit: ClipFit) -> None:
-        residual, _, inside = self._residual(betas, fit)
+        residual, inside = self.residual(betas, fit)
         assert self.seen is not None
         base = self.seen * inside
         usual = 1.48 * float(np.median(np.abs(residual[base > 0.5]))) if (base > 0.5).any() else 1.0
@@ -163,7 +168,7 @@ class Photo:
         self.weights = self.weight * _PHOTO_INDEPENDENT * base * robust / usual**2
 
     def cost(self, betas: np.ndarray, fit: ClipFit) -> float:
-        residual, _, inside = self._residual(betas, fit)
+        residual, inside = self.residual(betas, fit)
         assert self.weights is not None
         # a point that leaves the picture costs as a bad one does, lest leaving should pay
         return float((self.weights * np.where(inside, residual, 1.0) ** 2).sum())
@@ -185,13 +190,12 @@ class Photo:
         residual = (values - self.template)[:, None].astype(np.float32)
         return residual * root, slopes * root[:, None]
 
-    def _residual(
-        self, betas: np.ndarray, fit: ClipFit
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def residual(self, betas: np.ndarray, fit: ClipFit) -> tuple[np.ndarray, np.ndarray]:
+        """What the points show more than the template [F,L], and which are in the picture."""
         assert self.template is not None
         posed = _posed(self.model, betas, fit)
-        values, gradient, inside = sample(self.pictures, project(posed.points, fit.focal))
-        return values - self.template, gradient, inside
+        values, _, inside = sample(self.pictures, project(posed.points, fit.focal))
+        return values - self.template, inside
 
 
 def with_weight(term: Landmarks, factor: float) -> Landmarks:

@@ -117,6 +117,7 @@ def write_pictures(
             track.shot, track.rows, work, cache, lambda n: _cutting(tell, n, clip), should_stop
         )
         masks = _mended(masks, head, betas, clip, track)
+    parts = labels.of_triangles(head)
     for row, picture in enumerate(windows(track.shot, track.rows, work, should_stop)):
         if masks is None:
             rgba = np.concatenate([picture, np.ones_like(picture[..., :1])], axis=2)
@@ -126,7 +127,7 @@ def write_pictures(
         number = int(clip.frame_id[row])
         writer.image(clip.name, number, rgba)
         if masks is not None:
-            writer.labels(clip.name, number, labels.label(head, betas, clip, row, rgba))
+            writer.labels(clip.name, number, labels.label(head, parts, betas, clip, row, rgba))
         tell(0.4 + 0.6 * row / count, step=f"writing {clip.name}")
 
 

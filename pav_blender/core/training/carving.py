@@ -171,7 +171,7 @@ def _carry(canonical: np.ndarray, frame: Frame, triangles: np.ndarray, band: _Ba
     maps = triangle_maps(
         torch.from_numpy(frame.vertices),
         torch.from_numpy(canonical),
-        torch.from_numpy(triangles),
+        torch.tensor(triangles),
         "affine",
     ).numpy()
     scale = np.linalg.norm(maps[:, :, :3], axis=1).max(1)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import InputError
+from ...images import read_rgba
 from .labels import PARSING
 from .parsed import POSE_JOINTS, ParsedClip, Picture, stacked
 from .rotations import OPENGL
@@ -113,7 +114,5 @@ def _sibling(key: str, folder: str) -> str:
 
 
 def _size(path: Path) -> tuple[int, int]:
-    from ...images import read_rgba
-
     height, width = read_rgba(path).shape[:2]
     return width, height

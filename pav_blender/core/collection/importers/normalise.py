@@ -18,7 +18,7 @@ from ...progress import Report
 from ..model import Clip
 from ..writer import check_name
 from .parsed import JOINTS, VERTICES, ParsedClip, Picture
-from .registration import canonical_pose, fit_pose, fit_shape
+from .registration import fit_pose, fit_shape
 from .rotations import matrices
 
 SHAPES = ("mean", "first")
@@ -138,7 +138,7 @@ def _own_shape(clip: ParsedClip, head: HeadModel) -> np.ndarray:
         return np.asarray(clip.shape, np.float32)[: len(head.shape_basis)]
     count = len(head.expression_names)
     if clip.canonical is not None:
-        betas = fit_shape(head, clip.canonical[None], np.zeros((1, count)), canonical_pose(head))
+        betas = fit_shape(head, clip.canonical[None], np.zeros((1, count)), head.canonical_pose())
         return betas.astype(np.float32)
     if clip.vertices is None:
         raise InputError(f"clip {clip.name}: neither an identity nor meshes")

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import torch
 
 from ...head import HeadModel
 from ...head.flame import EYELIDS
-from ...head.model import CANONICAL_JAW_DEGREES
 from ...head.skinning import joint_motions, pose_vertices, rotation_matrices
 
 _TURNING = ("jaw", "left_eye", "right_eye")  # the joints that are looked for
@@ -19,14 +16,6 @@ _STILL = 1e-7
 _DIFFERENCE = 1e-5
 _CHUNK = 256
 _SAMPLES = 100  # vertices a part
-
-
-def canonical_pose(head: HeadModel) -> np.ndarray:
-    """The jaw, if there is one, open by 12 degrees: [1, J, 3]."""
-    pose = np.zeros((1, len(head.joint_names), 3))
-    if "jaw" in head.joint_names:
-        pose[0, head.joint_names.index("jaw"), 0] = math.radians(CANONICAL_JAW_DEGREES)
-    return pose
 
 
 def _turning(head: HeadModel) -> list[int]:
@@ -41,7 +30,7 @@ def fit_shape(
     A posed mesh is affine in the betas, so that this is one linear least-squares problem; every
     fourth vertex is enough for it.
     """
-    whole = head._tensors(torch.device("cpu"), torch.float64)
+    whole = head.tensors(torch.device("cpu"), torch.float64)
     chosen = torch.arange(0, head.vertex_count, 4)
     basis, weights = whole["shape_basis"][:, chosen], whole["skinning_weights"][chosen]
     rest_joints = whole["joint_regressor"] @ whole["template"]
@@ -102,7 +91,7 @@ def _chosen(head: HeadModel, lids: list[int]) -> np.ndarray:
 def _reduced(head: HeadModel, betas: np.ndarray, chosen: np.ndarray) -> dict:
     """The head of an identity, for `pose_vertices`, with few vertices; the joints follow them as
     vertices of their own, from which they are read."""
-    whole = head._tensors(torch.device("cpu"), torch.float64)
+    whole = head.tensors(torch.device("cpu"), torch.float64)
     shaped = torch.tensor(head.shaped(betas), dtype=torch.float64)
     joints = whole["joint_regressor"] @ shaped
     count = len(joints)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 
 import numpy as np
 
+from ...cores import threads
 from ...errors import InputError
 from ...images import read_gray, read_rgba
 from ...progress import Report
@@ -43,7 +43,7 @@ def write_person(
         overwrite=overwrite,
     ) as writer:
         for each in person.clips:
-            with ThreadPoolExecutor(_threads()) as pool:
+            with ThreadPoolExecutor(threads()) as pool:
                 jobs = [pool.submit(_write, writer, each, row) for row in range(len(each.clip))]
                 try:
                     for job in as_completed(jobs):
@@ -56,10 +56,6 @@ def write_person(
                         job.cancel()
                     raise
             writer.clip(each.clip)
-
-
-def _threads() -> int:
-    return int(os.environ.get("PAV_THREADS") or os.cpu_count() or 1)
 
 
 def _write(writer: CollectionWriter, each: NormalClip, row: int) -> None:

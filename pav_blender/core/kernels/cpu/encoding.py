@@ -10,6 +10,7 @@ import torch
 from numba import njit
 from torch import Tensor
 
+from ...cores import threads
 from ...errors import InputError
 from ..reference.encoding import (
     FEATURES,
@@ -23,7 +24,7 @@ from ..reference.encoding import (
 from ..reference.optimiser import check_adam
 from . import corners, rows
 from .optimiser import adam_range, adam_settings
-from .threads import run_chunks, threads
+from .threads import run_chunks
 
 __all__ = [
     "Layout",

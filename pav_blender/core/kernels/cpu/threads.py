@@ -17,19 +17,11 @@ from typing import Any
 
 import torch
 
+from ...cores import threads
+
 _pool: ThreadPoolExecutor | None = None
 _pool_size = 0
 _here = threading.local()
-
-
-def threads() -> int:
-    """Workers to use: `PAV_THREADS` if it is a positive number, else the CPUs we may run on."""
-    wanted = os.environ.get("PAV_THREADS", "")
-    if wanted.isdigit() and int(wanted) > 0:
-        return int(wanted)
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 @contextlib.contextmanager
