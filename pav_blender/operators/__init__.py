@@ -1,8 +1,8 @@
 """Operators: a few lines each over `bridge`."""
 
-from . import avatar, jobs
+from . import avatar, jobs, motion, output, training
 
-modules = (avatar, jobs)
+modules = (avatar, motion, training, output, jobs)
 
 
 def register() -> None:

@@ -1,4 +1,4 @@
-"""Bringing avatars and tracks into the scene."""
+"""Bringing avatars into the scene, and heads out of it."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import Any, ClassVar
 
 import bpy
 
-from ..bridge import avatars, requirements
+from ..bridge import requirements
 from ..bridge import scene as bridge_scene
-from ..core.errors import InputError
+from .context import object_mode, select
 from .reporting import reporting
 
 
@@ -32,38 +32,10 @@ class PAV_OT_add_head(bpy.types.Operator):
     @reporting
     def execute(self, context: Any) -> set[str]:
         requirements.check()
-        _object_mode(context)
+        object_mode(context)
         rig = bridge_scene.build_head(Path(self.filepath))
-        _select(context, rig.mesh)
+        select(context, rig.mesh)
         bridge_scene.use_engine(context.scene)
-        return {"FINISHED"}
-
-
-class PAV_OT_import_track(bpy.types.Operator):
-    """Animate the active head, and the camera, as in a clip of a collection"""
-
-    bl_idname = "pav.import_track"
-    bl_label = "Import Track"
-    bl_options: ClassVar = {"REGISTER", "UNDO"}
-
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        return find_head(context) is not None
-
-    @reporting
-    def execute(self, context: Any) -> set[str]:
-        requirements.check()
-        from ..core.collection import read_collection
-
-        settings = context.scene.pav
-        if not settings.collection:
-            raise InputError("choose the collection's folder first")
-        _object_mode(context)
-        collection = read_collection(avatars.resolve(settings.collection))
-        clip = settings.clip or collection.clips[0].name
-        bridge_scene.import_track(find_head(context), collection, clip)
-        bridge_scene.use_engine(context.scene)
-        self.report({"INFO"}, f"{clip}: {len(collection.clip(clip))} frames")
         return {"FINISHED"}
 
 
@@ -99,31 +71,5 @@ class PAV_OT_save_head(bpy.types.Operator):
         return {"FINISHED"}
 
 
-def find_head(context: Any) -> Any | None:
-    """The active object if it is a head, else the head that the active object deforms or holds,
-    else the scene's only head."""
-    active = context.active_object
-    if active is not None and active.pav.avatar:
-        return active
-    if active is not None:
-        for child in active.children:
-            if child.pav.avatar:
-                return child
-    heads = [object_ for object_ in context.scene.objects if object_.pav.avatar]
-    return heads[0] if len(heads) == 1 else None
-
-
-def _object_mode(context: Any) -> None:
-    if context.mode != "OBJECT":
-        bpy.ops.object.mode_set(mode="OBJECT")
-
-
-def _select(context: Any, object_: Any) -> None:
-    for other in context.selected_objects:
-        other.select_set(False)
-    object_.select_set(True)
-    context.view_layer.objects.active = object_
-
-
-classes = (PAV_OT_add_head, PAV_OT_import_track, PAV_OT_save_head)
+classes = (PAV_OT_add_head, PAV_OT_save_head)
 register, unregister = bpy.utils.register_classes_factory(classes)

@@ -1,5 +1,15 @@
-"""Panels and preferences."""
+"""Panels: each draws, none computes."""
 
-from . import panels
+from . import avatar, motion, output, training
 
-register, unregister = panels.register, panels.unregister
+modules = (avatar, motion, training, output)
+
+
+def register() -> None:
+    for module in modules:
+        module.register()
+
+
+def unregister() -> None:
+    for module in reversed(modules):
+        module.unregister()

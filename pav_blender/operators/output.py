@@ -1,0 +1,33 @@
+"""Writing frames without the render pipeline."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from ..bridge import jobs, sequence
+from .reporting import reporting
+
+
+class PAV_OT_write_sequence(bpy.types.Operator):
+    """Write the scene's frames as PNG into the output folder; frames already there are kept"""
+
+    bl_idname = "pav.write_sequence"
+    bl_label = "Write Frames"
+
+    @classmethod
+    def poll(cls, _context: Any) -> bool:
+        return not jobs.running()
+
+    @reporting
+    def execute(self, context: Any) -> set[str]:
+        scene = context.scene
+        folder = Path(bpy.path.abspath(scene.render.filepath))
+        jobs.start(jobs.WRITING, lambda: sequence.begin(scene, folder), f"Frames are in {folder}")
+        return {"FINISHED"}
+
+
+classes = (PAV_OT_write_sequence,)
+register, unregister = bpy.utils.register_classes_factory(classes)
