@@ -368,11 +368,12 @@ def test_of_two_people_the_one_who_comes_back_is_tracked(tmp_path):
 def test_labels_are_mostly_right_where_the_truth_is_known():
     collection = read_collection(filmed.STUDIO)
     hits = np.zeros((len(LABELS), len(LABELS)))
+    parts = labels.of_triangles(collection.head)
     for clip in collection.clips:
         for row in (0, 24):
             rgba = read_rgba(collection.image_path(clip, row))
             true = read_gray(collection.labels_path(clip, row))
-            found = labels.label(collection.head, collection.betas, clip, row, rgba)
+            found = labels.label(collection.head, parts, collection.betas, clip, row, rgba)
             np.add.at(hits, (true.ravel(), found.ravel()), 1)
     overlap = np.diag(hits) / (hits.sum(0) + hits.sum(1) - np.diag(hits)).clip(1)
     least = {"face": 0.7, "lips": 0.8, "eyes": 0.9, "mouth": 0.85, "scalp_hair": 0.65}

@@ -38,7 +38,7 @@ def fit_shape(
     count = len(basis)
     normal = torch.zeros(count, count, dtype=torch.float64)
     right = torch.zeros(count, dtype=torch.float64)
-    none = np.zeros(count)
+    none, pose = np.zeros(count), np.asarray(pose, np.float64)
     for mesh, values, turns in zip(vertices, expression, pose, strict=True):
         moved = torch.tensor(values)[None], torch.tensor(turns)[None], np.zeros((1, 3))
         posed = head.pose(none, *moved)[0][chosen]
