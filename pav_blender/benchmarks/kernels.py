@@ -15,7 +15,7 @@ import torch
 from ..core import kernels
 from ..core.evaluation.report import Claim
 from ..core.progress import Report
-from ..core.rendering.render import deformer_of
+from ..core.rendering.wearing import deformer_of
 from .measure import Options, a_frame, best, plot, show, subject
 
 _N = 1 << 16  # samples

@@ -11,7 +11,7 @@ from ..core.deformation.rigid import stance
 from ..core.field.avatar import Avatar
 from ..core.field.field import condition
 from ..core.rendering.rays import camera_rays, pack, samples_of
-from ..core.rendering.render import space_of
+from ..core.rendering.wearing import space_of
 from ..core.training.frames import Frame
 
 _RAYS = 2  # at once: every sample is held against every triangle
@@ -22,15 +22,14 @@ def dense(avatar: Avatar, frame: Frame, pixels: np.ndarray, samples: int = 1024)
     appearance: `samples` places along the 0.4 metres of ray around the head, each evaluated."""
     step = 0.4 / samples
     camera = frame.camera
-    rows = (frame.appearance,)
     with torch.inference_mode(), kernels.plain_torch():
         deformer = Deformer(
             avatar.canonical_vertices, avatar.triangles, avatar.config.frames, reference=True
         )
-        mesh, space = deformer.pose(frame.vertices), space_of(avatar, rows)
+        mesh, space = deformer.pose(frame.vertices), space_of(avatar, frame.appearance)
         stands = stance(avatar.canonical_vertices, frame.vertices, avatar.rigid_weights)
         seen = condition(avatar.config, frame.expression, stands.turn)
-        worn = avatar.field.blend(torch.eye(len(avatar.appearances))[frame.appearance])
+        worn = avatar.field.wearing([frame.appearance])
         ops = kernels.select("cpu").marching
         found = []
         for start in range(0, len(pixels), _RAYS):

@@ -61,9 +61,12 @@ def stirred(toy, frames, changes):
 
 
 @pytest.mark.parametrize("name", FIELDS)
-def test_every_kind_of_field_looks_the_same(toy, frames, pose, name, monkeypatch):
+@pytest.mark.parametrize("worn", ["one", "several"])
+def test_every_kind_of_field_looks_the_same(toy, frames, pose, name, worn, monkeypatch):
     avatar = stirred(toy, frames, FIELDS[name])
-    blend = {"plain": 0.7, "bushy": 0.3}
+    height = avatar.canonical_vertices[:, 1]
+    upper = (height > np.median(height)) * np.float32(0.7)
+    blend = {"plain": 1 - upper, "bushy": upper} if worn == "several" else "plain"
     whole = render(avatar, appearance=blend, settings=EVERY, **pose)
     monkeypatch.setattr(rendering, "_whole", rendering._by_waves)
     steps = render(avatar, appearance=blend, settings=EVERY, **pose)
@@ -96,7 +99,7 @@ def test_a_frozen_field_is_the_field(toy, frames, name):
     avatar = stirred(toy, frames, FIELDS[name])
     field = avatar.field.double()
     seen = condition(avatar.config, np.zeros(len(avatar.expression_names)), np.ones(3)).double()
-    worn = field.blend(torch.tensor([0.2, 0.8]))
+    worn = field.wearing([1])
     frozen = freeze(field, seen, worn)
     geometry = torch.randn(5, avatar.config.geometry_channels, dtype=torch.float64)
     with torch.no_grad():
@@ -105,7 +108,7 @@ def test_a_frozen_field_is_the_field(toy, frames, name):
         whole = x @ field.density.weights[0].T + field.density.biases[0]
         whole = whole + field.density.group_weight @ seen
         torch.testing.assert_close(x @ weight.T + bias, whole)
-        rows = frozen.latent[:1].expand(5, -1)
+        rows = frozen.latent[0, :1].expand(5, -1)
         embedding = worn.latent[0, :1] if avatar.config.appearance == "vertex" else worn.latent
         if worn.code.shape[1]:
             embedding = embedding + worn.code

@@ -218,8 +218,8 @@ class Field(nn.Module):
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Density [N] per metre, and what the colour depends on besides the view [N, C].
 
-        `worn` stands in for the learned appearances, e.g. a blend of them (see `blend`); `encoded`
-        for phi(x_c), where it is at hand.
+        `worn` stands in for the learned appearances, e.g. some of them; `encoded` for phi(x_c),
+        where it is at hand.
         """
         if encoded is None:
             encoded = self.encode(samples)
@@ -272,10 +272,6 @@ class Field(nn.Module):
         """The learned appearances themselves."""
         return Worn(self.latent, self.code)
 
-    def blend(self, weights: torch.Tensor) -> Worn:
-        """A blend of the appearances by weights [A], as the only appearance there is."""
-        w = weights.to(self.latent)
-        return Worn(
-            torch.tensordot(w, self.latent.detach(), 1)[None],
-            torch.tensordot(w, self.code.detach(), 1)[None],
-        )
+    def wearing(self, rows: list[int]) -> Worn:
+        """The appearances in `rows` alone."""
+        return Worn(self.latent.detach()[rows], self.code.detach()[rows])

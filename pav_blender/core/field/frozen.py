@@ -6,17 +6,27 @@ import torch
 
 from ..kernels.structures import Frozen, Layers
 from .field import Field, Mlp, Worn
+from .mixture import EMPTY, FIRMNESS, SOLID, THICK, Mixture
 
 
-def freeze(field: Field, condition: torch.Tensor, worn: Worn) -> Frozen:
-    """The field under a condition [E] (`field.condition`), for the only appearance in `worn`."""
+def freeze(
+    field: Field, condition: torch.Tensor, worn: Worn, mixture: Mixture | None = None
+) -> Frozen:
+    """The field under a condition [E] (`field.condition`), for the only appearance in `worn`, or
+    for a mixture of those there."""
     config = field.config
     embedding, geometry = config.embedding_channels, config.geometry_channels
-    latent = (worn.latent[0] + worn.code[0] if worn.code.shape[1] else worn.latent[0]).detach()
+    count, latent = len(worn.latent), worn.latent.detach()
+    if worn.code.shape[1]:
+        latent = latent + worn.code.detach().view(count, *[1] * (latent.dim() - 2), -1)
     nothing = latent.new_zeros(0)
     same = nothing  # an embedding that is the same everywhere
-    if config.appearance in ("global", "none"):
-        same, latent = latent, latent.new_zeros(1, 0)
+    if latent.dim() == 2 and count == 1:
+        same, latent = latent[0], latent.new_zeros(1, 1, 0)
+    elif latent.dim() == 2:  # the same at every vertex, but not for every appearance
+        vertices = int(field.triangles.max()) + 1
+        latent = latent[:, None].expand(-1, vertices, -1)
+    one = torch.ones(1, 1, 1, 1)
     colour = _folded(field.colour, nothing, same)
     offset = None
     if field.offset is not None:
@@ -43,6 +53,9 @@ def freeze(field: Field, condition: torch.Tensor, worn: Worn) -> Frozen:
         field.corner_uvs if surface else field.corner_uvs[:0],
         (config.density_bias, rise, config.mesh_falloff, config.mesh_skin),
         config.log_density_limit,
+        one if mixture is None else mixture.shares,
+        one.bool() if mixture is None else mixture.filled,
+        (EMPTY, SOLID, FIRMNESS, THICK),
     )
 
 

@@ -155,10 +155,14 @@ class Frozen:
     offset: Layers | None
     colour: Layers
     view: torch.Tensor  # [16, hidden]: harmonics of the direction to the colour's first layer
-    latent: torch.Tensor  # [V, C] at vertices or [S, S, C] texels; C may be 0
+    latent: torch.Tensor  # [K, V, C] at vertices or [K, S, S, C] texels; C may be 0
     corner_uvs: torch.Tensor  # [T, 3, 2] where there are texels, else [0, 3, 2]
     untrained: tuple[float, float, float, float]  # far log-density, rise at the mesh, falloff, skin
     limit: float  # of log-densities
+    # several appearances at once, K > 1 (`field.mixture`), else [1, 1, 1, 1] of 1 and True
+    shares: torch.Tensor  # [K, S, S, S]
+    filled: torch.Tensor  # [K, G, G, G] bool
+    mixing: tuple[float, float, float, float]  # empty, solid (a millimetre), firmness, thickness
 
 
 class Traced(NamedTuple):

@@ -34,6 +34,11 @@ def guide(avatar: Avatar, deformer: Deformer, worn: Worn, occupied: np.ndarray) 
         )  # fmt: skip
         density = avatar.field.geometry(samples.to(avatar.field.device), worn)[0]
         found = torch.maximum(found, density.cpu())
-    grid = torch.zeros(1, 1, count, count, count)
-    grid[0, 0][torch.from_numpy(occupied)] = found
-    return torch.nn.functional.max_pool3d(grid, 3, 1, 1)[0, 0]
+    grid = torch.zeros(1, count, count, count)
+    grid[0][torch.from_numpy(occupied)] = found
+    return neighbourhood(grid)[0]
+
+
+def neighbourhood(grids: torch.Tensor) -> torch.Tensor:
+    """The greatest value in each cell or one beside it, of grids [K, G, G, G]."""
+    return torch.nn.functional.max_pool3d(grids[:, None], 3, 1, 1)[:, 0]

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import threading
-import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -13,20 +12,20 @@ import numpy as np
 import torch
 
 from .. import kernels
-from ..deformation import Clearance, Deformer, PosedMesh, Thrift, Voxels, clearance, voxels
+from ..deformation import Clearance, PosedMesh, Thrift, Voxels, voxels
 from ..deformation.rigid import Stance, stance
 from ..errors import Cancelled, InputError
 from ..field.avatar import Avatar
 from ..field.directions import spherical_harmonics
-from ..field.field import Worn, condition
+from ..field.field import Samples, condition
 from ..field.frozen import freeze
+from ..field.mixture import Mixture, geometry
 from ..kernels.cpu.threads import run_chunks, torch_alone
 from ..kernels.structures import Frozen, Picks, Probing, Traced, Wave
 from .cameras import Camera
-from .guide import guide
 from .rays import RayBatch, camera_rays, pack, samples_of, tiled
+from .wearing import Appearance, Wearing, deformer_of, wearing_of
 
-Appearance = str | Mapping[str, float]
 _FAR_WAVE = 24  # samples a ray between two looks, where every look waits for a device
 
 
@@ -88,86 +87,30 @@ class Scene:
 
     avatar: Avatar
     mesh: PosedMesh
-    clearance: Clearance
     voxels: Voxels
-    guide: torch.Tensor
     stance: Stance
     condition: torch.Tensor
-    worn: Worn
+    wearing: Wearing
+
+    @property
+    def clearance(self) -> Clearance:
+        """Where anything may be, in canonical space."""
+        return self.wearing.space
 
     @cached_property
     def known(self) -> torch.Tensor:
         """What the guide knows of the density in each voxel."""
-        return kernels.select("cpu").tracing.known_density(self.voxels, self.guide)
+        return kernels.select("cpu").tracing.known_density(self.voxels, self.wearing.guide)
 
     @cached_property
     def frozen(self) -> Frozen:
         """The field held still."""
-        return freeze(self.avatar.field, self.condition, self.worn)
+        return freeze(self.avatar.field, self.condition, self.wearing.worn, self.wearing.mixture)
 
     @cached_property
     def packed(self) -> tuple[Any, ...]:
         """The same as compiled functions take it."""
         return kernels.select("cpu").tracing.arrays_of(self.frozen)
-
-
-_deformers: weakref.WeakKeyDictionary[Avatar, Deformer] = weakref.WeakKeyDictionary()
-_clearances: weakref.WeakKeyDictionary[Avatar, dict[tuple[int, ...], Clearance]] = (
-    weakref.WeakKeyDictionary()
-)
-_guides: weakref.WeakKeyDictionary[Avatar, dict[int, torch.Tensor]] = weakref.WeakKeyDictionary()
-
-
-def deformer_of(avatar: Avatar) -> Deformer:
-    """The avatar's deformer, built once."""
-    if avatar not in _deformers:
-        _deformers[avatar] = Deformer(
-            avatar.canonical_vertices, avatar.triangles, avatar.config.frames
-        )
-    return _deformers[avatar]
-
-
-def space_of(avatar: Avatar, rows: tuple[int, ...]) -> Clearance:
-    """Where the appearances in `rows` fill space, computed once."""
-    known = _clearances.setdefault(avatar, {})
-    if rows not in known:
-        occupied = avatar.occupied[list(rows)].any(0)
-        known[rows] = clearance_of(occupied, avatar.box_min, avatar.box_size)
-    return known[rows]
-
-
-def guide_of(avatar: Avatar, weights: np.ndarray) -> torch.Tensor:
-    """The density (1/m) of each cell [G, G, G] where appearances are worn by weights [A]; that of
-    an appearance is computed once."""
-    known = _guides.setdefault(avatar, {})
-    total = torch.zeros(avatar.occupied.shape[1:])
-    for row in np.flatnonzero(weights):
-        if row not in known:
-            worn = avatar.field.blend(torch.eye(len(weights))[row])
-            known[row] = guide(avatar, deformer_of(avatar), worn, avatar.occupied[row])
-        total += float(weights[row]) * known[row]
-    return total
-
-
-def clearance_of(occupied: np.ndarray, box_min: np.ndarray, box_size: float) -> Clearance:
-    """The clearance grid of cells [G, G, G] bool over a cube."""
-    return Clearance(
-        torch.from_numpy(clearance(occupied)),
-        torch.from_numpy(np.asarray(box_min, np.float32)),
-        1 / box_size,
-    )
-
-
-def appearance_weights(avatar: Avatar, appearance: Appearance) -> np.ndarray:
-    """Weights [A], sum 1. InputError for unknown names or weights that make no blend."""
-    chosen = {appearance: 1.0} if isinstance(appearance, str) else dict(appearance)
-    weights = np.zeros(len(avatar.appearances), np.float32)
-    for name, weight in chosen.items():
-        weights[avatar.appearance_index(name)] += weight
-    total = float(weights.sum())
-    if not (np.isfinite(weights).all() and (weights >= 0).all() and total > 0):
-        raise InputError(f"appearance weights {chosen}: finite, none negative, one above 0")
-    return weights / total
 
 
 def pose_scene(
@@ -189,24 +132,12 @@ def pose_scene(
     values = np.zeros(count, np.float32) if expression is None else np.asarray(expression)
     if values.shape != (count,) or not np.isfinite(values).all():
         raise InputError(f"expression: {values.shape} values; the avatar takes {count} finite ones")
-    weights = appearance_weights(avatar, appearance)
-    rows = tuple(int(i) for i in np.flatnonzero(weights))
-    canonical = avatar.canonical_vertices
-    stands = stance(canonical, vertices, avatar.rigid_weights)
-    mesh, space = deformer_of(avatar).pose(vertices), space_of(avatar, rows)
+    wearing = wearing_of(avatar, appearance)
+    stands = stance(avatar.canonical_vertices, vertices, avatar.rigid_weights)
+    mesh = deformer_of(avatar).pose(vertices)
+    filled = voxels(mesh, wearing.space, avatar.config.reach)
     seen = condition(avatar.config, values.astype(np.float32), stands.turn)
-    worn = avatar.field.blend(torch.from_numpy(weights))
-    filled, guide = voxels(mesh, space, avatar.config.reach), guide_of(avatar, weights)
-    return Scene(
-        avatar,
-        mesh,
-        space,
-        filled,
-        guide,
-        stands,
-        seen,
-        worn,
-    )
+    return Scene(avatar, mesh, filled, stands, seen, wearing)
 
 
 def render(
@@ -223,8 +154,9 @@ def render(
 ) -> Picture:
     """Renders the avatar on a posed mesh [V, 3]; the paper's Eq. 2 as a quadrature.
 
-    appearance: a name, or weights by name. region: only the pixels (x0, y0, x1, y1), top-left
-    origin. Raises InputError for input that does not fit and Cancelled when `should_stop()`.
+    appearance: a name, or weights by name, each a number or one a vertex. region: only the pixels
+    (x0, y0, x1, y1), top-left origin. Raises InputError for input that does not fit and Cancelled
+    when `should_stop()`.
     """
     settings = settings or RenderSettings()
     if region is not None:
@@ -352,7 +284,7 @@ def _by_waves(scene: Scene, rays: RayBatch, settings: RenderSettings) -> Traced:
         if len(packed):
             samples = samples_of(packed, scene.clearance, 0, scene.condition, part, scene.stance)
             samples = samples.to(device)
-            sigma, inputs = field.geometry(samples, scene.worn)
+            sigma, layers = _geometry(scene, samples)
             evaluations += len(sigma)
             ray = alive[packed.ray.long()].to(device)
             width = torch.full_like(sigma, settings.step)
@@ -361,13 +293,29 @@ def _by_waves(scene: Scene, rays: RayBatch, settings: RenderSettings) -> Traced:
             weights = there.marching.weigh(sigma, width, ray.int(), left)
             depth.index_add_(0, ray, weights * packed.t.to(device))
             shown = (weights > settings.negligible * width).nonzero()[:, 0]
-            rgb = field.shade(inputs[shown], samples.direction, samples.ray[shown])
-            weight = weights[shown, None]
-            colour.index_add_(0, ray[shown], torch.cat([weight * rgb, weight], 1))
+            for seen, portion in layers:
+                rgb = field.shade(seen[shown], samples.direction, samples.ray[shown])
+                weight = (weights * portion)[shown, None]
+                colour.index_add_(0, ray[shown], torch.cat([weight * rgb, weight], 1))
         first[alive] = wave.next
         going = (wave.next <= last[alive]) & (left.cpu()[alive] > settings.transmittance)
         alive = alive[going]
     return Traced(colour, depth, left, evaluations)
+
+
+def _geometry(
+    scene: Scene, samples: Samples
+) -> tuple[torch.Tensor, list[tuple[torch.Tensor, torch.Tensor | float]]]:
+    """Densities [N] per metre; of each appearance what its colour depends on [N, C], and its part
+    in the colour ([N], or 1 where there is no other)."""
+    field, wearing = scene.avatar.field, scene.wearing
+    if wearing.mixture is None:
+        sigma, inputs = field.geometry(samples, wearing.worn)
+        return sigma, [(inputs, 1.0)]
+    device = field.device
+    mixture = Mixture(wearing.mixture.shares.to(device), wearing.mixture.filled.to(device))
+    sigma, parts, seen = geometry(field, mixture, wearing.worn, samples)
+    return sigma, list(zip(seen, parts.T, strict=True))
 
 
 def _wave(
@@ -391,7 +339,7 @@ def _wave(
     return ops.picking.pick(
         scene.mesh,
         scene.voxels,
-        scene.guide,
+        scene.wearing.guide,
         *lattice,
         middle,
         left,

@@ -15,7 +15,7 @@ from .. import kernels
 from ..deformation import Clearance, Deformer
 from ..field.avatar import Avatar
 from ..kernels.reference.picking import LEAST
-from ..rendering.render import clearance_of
+from ..rendering.wearing import clearance_of
 
 _MUCH = 0.5  # part of the space that is left when voxels are worth finding anew
 _SEEN = 0.1  # transmittance from which a look at a cell counts

@@ -15,7 +15,8 @@ import torch
 
 from ..rendering.cameras import Camera
 from ..rendering.rays import RayBatch, camera_rays, tiled
-from ..rendering.render import RenderSettings, Scene, deformer_of, trace_rays
+from ..rendering.render import RenderSettings, Scene, trace_rays
+from ..rendering.wearing import deformer_of
 from .corrections import RIGID, Space, motion, seen_from
 
 _ITERATIONS = 3

@@ -16,6 +16,7 @@ from ..deformation import Deformer
 from ..field.avatar import Avatar
 from ..field.field import Samples, condition
 from ..rendering.render import Scene
+from ..rendering.wearing import Wearing
 from .attention import Attention
 from .batches import KEPT_POSES, Poses, draw_pixels, pick_samples
 from .frames import Frame, halved
@@ -166,10 +167,10 @@ class Trainer:
         space, version = self.visibility.spaces[row], self.visibility.version
         posed = self._poses(frame, space, version, self.config.reach)
         with torch.no_grad():
-            worn = field.blend(torch.eye(len(self.avatar.appearances))[row])
+            worn = field.wearing([row])
             seen = condition(self.config, frame.expression, posed.stance.turn)
-        guide = self.visibility.guide[row]
-        return Scene(self.avatar, posed.mesh, space, posed.voxels, guide, posed.stance, seen, worn)
+        wearing = Wearing(worn, None, space, self.visibility.guide[row])
+        return Scene(self.avatar, posed.mesh, posed.voxels, posed.stance, seen, wearing)
 
     def _choose_frames(self) -> list[Frame]:
         """Frames of a batch: appearances in turn, frames at random; small pictures come first."""

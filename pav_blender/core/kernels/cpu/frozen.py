@@ -27,13 +27,21 @@ ROOM = corners.BLOCK  # samples past the last that a block may touch
 
 def arrays_of(field: Frozen) -> tuple[Any, ...]:
     """What compiled functions are told of a field: encodings, density and offset, colour, latent,
-    and the numbers of an untrained density."""
+    the numbers of an untrained density, and how appearances mix."""
     return (
         _encodings(field),
         (_packed(field.density), _packed(field.offset), field.offset is not None),
         _packed(field.colour),
         _latent(field),
         np.array([*field.untrained, field.limit], np.float32),
+        (
+            len(field.shares),
+            rows_of(field.shares.reshape(-1), np.float32),
+            field.shares.shape[1],
+            rows_of(field.filled.reshape(-1), np.bool_),
+            field.filled.shape[1],
+            np.array(field.mixing, np.float32),
+        ),
     )
 
 
@@ -55,8 +63,9 @@ def _packed(layers: Layers | None) -> tuple[np.ndarray, np.ndarray]:
 def _latent(field: Frozen) -> tuple[Any, ...]:
     """The latent features in a row, their number, texels a side (0: at vertices), corners' UVs."""
     width = field.latent.shape[-1]
-    side = field.latent.shape[0] if len(field.corner_uvs) else 0
-    return rows_of(field.latent, np.float32).reshape(-1), width, side, flat(field.corner_uvs)
+    side = field.latent.shape[1] if len(field.corner_uvs) else 0
+    features = rows_of(field.latent.reshape(-1), np.float32)
+    return features, width, side, flat(field.corner_uvs)
 
 
 @njit(**INLINE)
@@ -102,18 +111,20 @@ def _encode(encoding, places, axes, start, count, features, row, scratch):
 
 
 @njit(**INLINE)
-def _embed(surface, mesh_corners, triangle, places, begin, count, index, weight, out, step):
-    """The appearance's features at samples from `begin` on, one row of out each."""
+def _embed(surface, first, mesh_corners, triangle, places, begin, count, index, weight, out, row,
+           step):  # fmt: skip
+    """An appearance's features, which are from `first` on, at samples from `begin` on, one row of
+    out each from `row` on."""
     latent, width, side, uvs = surface
     if width == 0:
         return
     if side == 0:
         for i in range(count):
             for k in range(3):
-                index[k * rows.STRIDE + i] = mesh_corners[triangle[begin + i] * 3 + k]
+                index[k * rows.STRIDE + i] = first + mesh_corners[triangle[begin + i] * 3 + k]
                 weight[k * rows.STRIDE + i] = places[WEIGHTS + k, begin + i]
         for i in range(count):
-            rows.mix3(latent, width, index, weight, i, out, (begin + i) * step)
+            rows.mix3(latent, width, index, weight, i, out, (row + i) * step)
         return
     right = min(1, side - 1)
     for i in range(count):
@@ -125,17 +136,70 @@ def _embed(surface, mesh_corners, triangle, places, begin, count, index, weight,
         x, fx = rows.texel(u, side)
         y, fy = rows.texel(v, side)
         for k in range(4):
-            index[k * rows.STRIDE + i] = (y + right * (k >> 1)) * side + x + right * (k & 1)
+            texel = (y + right * (k >> 1)) * side + x + right * (k & 1)
+            index[k * rows.STRIDE + i] = first + texel
             across = fx if k & 1 else np.float32(1) - fx
             weight[k * rows.STRIDE + i] = across * (fy if k >> 1 else np.float32(1) - fy)
     for i in range(count):
-        rows.mix4(latent, width, index, weight, i, out, (begin + i) * step)
+        rows.mix4(latent, width, index, weight, i, out, (row + i) * step)
 
 
 @njit(**INLINE)
-def densities(start, stop, field, mesh_corners, samples, features, inputs, sigma):
-    """What the networks see of samples start..stop, and their densities (1/m)."""
-    encodings, networks, _, latent, untrained = field
+def _share(shares, size, first, x, y, z):
+    """A grid's value at a place of the unit box; values are those of the cells' middles."""
+    total = np.float32(0)
+    side, half = np.float32(size), np.float32(0.5)
+    px, py, pz = x * side - half, y * side - half, z * side - half
+    ix, iy, iz = np.int64(np.floor(px)), np.int64(np.floor(py)), np.int64(np.floor(pz))
+    fx, fy, fz = px - np.float32(ix), py - np.float32(iy), pz - np.float32(iz)
+    for corner in range(8):
+        a, b, c = corner >> 2, (corner >> 1) & 1, corner & 1
+        weight = fx if a else np.float32(1) - fx
+        weight *= fy if b else np.float32(1) - fy
+        weight *= fz if c else np.float32(1) - fz
+        at = min(max(ix + a, 0), size - 1) * size + min(max(iy + b, 0), size - 1)
+        total += weight * shares[first + at * size + min(max(iz + c, 0), size - 1)]
+    return total
+
+
+@njit(**INLINE)
+def _mix(begin, end, mixing, places, parts, sigma):
+    """`field.mixture.mix`: parts hold each appearance's density (1/m), and then its part in the
+    colour."""
+    count, shares, size, filled, cells, numbers = mixing
+    empty, thick = numbers[0], numbers[3]
+    widest = np.log(numbers[1] / empty)
+    room = len(sigma)
+    for i in range(begin, end):
+        x, y, z = places[0, i], places[1, i], places[2, i]
+        cell = min(np.int64(x * np.float32(cells)), cells - 1) * cells
+        cell = (cell + min(np.int64(y * np.float32(cells)), cells - 1)) * cells
+        cell += min(np.int64(z * np.float32(cells)), cells - 1)
+        fading = beyond = total = np.float32(0)
+        for k in range(count):
+            density = np.float32(0)
+            if filled[k * cells**3 + cell]:
+                density = parts[k * room + i] * np.float32(1e-3)
+            share = _share(shares, size, k * size**3, x, y, z)
+            above = np.log(max(density / empty, np.float32(1)))
+            fading += share * min(above, widest)
+            beyond += share * max(above - widest, np.float32(0))
+            part = share * (np.float32(1) - np.exp(-density * thick))
+            parts[k * room + i] = part
+            total += part
+        solid = (fading / widest) ** numbers[2]
+        sigma[i] = empty * (np.exp(fading + solid * beyond) - np.float32(1)) * np.float32(1e3)
+        for k in range(count):
+            parts[k * room + i] /= max(total, np.float32(1e-12))
+
+
+@njit(**INLINE)
+def densities(start, stop, field, mesh_corners, samples, features, inputs, sigma, parts):
+    """What the networks see of samples start..stop, their densities (1/m), and each appearance's
+    part in the colour where there are several: appearance k has row k * len(sigma) + sample."""
+    encodings, networks, _, latent, untrained, mixing = field
+    count, room = mixing[0], len(sigma)
+    of_one = len(latent[0]) // count // max(latent[1], 1)
     triangle, places = samples
     corner_scratch = (
         np.zeros(3 * corners.BLOCK, np.float32),
@@ -145,7 +209,6 @@ def densities(start, stop, field, mesh_corners, samples, features, inputs, sigma
     index, weight = np.zeros(4 * rows.STRIDE, np.int64), np.zeros(4 * rows.STRIDE, np.float32)
     density_work, offset_work = workspace(networks[0][0]), workspace(networks[1][0])
     (plan, packed), (offset_plan, offset), has_offset = networks
-    room = features.shape[1]
     embedding, geometry = latent[1], plan[-1, OUT]
     columns = embedding + geometry
     no_rows, no_group = np.zeros((0, 0), np.float32), np.zeros(0, np.int32)
@@ -156,24 +219,33 @@ def densities(start, stop, field, mesh_corners, samples, features, inputs, sigma
     seen = features.ravel()
     for begin in range(start, stop, BLOCK):
         n = min(BLOCK, stop - begin)
-        through_layers(zero, n, n, len(plan), seen, begin - start, one, room, packed, plan, no_rows,
-                       no_group, density_work)  # fmt: skip
-        _embed(latent, mesh_corners, triangle, places, begin, n, index, weight, inputs,
-               columns)  # fmt: skip
-        at, wide = plan[-1, HIDDEN], plan[-1, OUT_PAD]
-        for i in range(n):
-            to = (begin + i) * columns + embedding
-            for k in range(geometry):
-                inputs[to + k] = density_work[at + i * wide + k]
-        if has_offset:
-            through_layers(zero, n, n, len(offset_plan), inputs, begin * columns, columns, one,
-                           offset, offset_plan, no_rows, no_group, offset_work)  # fmt: skip
-            at, wide = offset_plan[-1, HIDDEN], offset_plan[-1, OUT_PAD]
+        through_layers(zero, n, n, len(plan), seen, begin - start, one, features.shape[1], packed,
+                       plan, no_rows, no_group, density_work)  # fmt: skip
+        for k in range(count):
+            row = k * room + begin
+            _embed(latent, k * of_one, mesh_corners, triangle, places, begin, n, index, weight,
+                   inputs, row, columns)  # fmt: skip
+            at, wide = plan[-1, HIDDEN], plan[-1, OUT_PAD]
             for i in range(n):
-                inputs[(begin + i) * columns + embedding] += offset_work[at + i * wide]
-        for i in range(begin, begin + n):
-            raw = inputs[i * columns + embedding] + _untrained(places[DISTANCE, i], untrained)
-            sigma[i] = np.exp(min(raw, untrained[4])) * np.float32(1e3)
+                to = (row + i) * columns + embedding
+                for channel in range(geometry):
+                    inputs[to + channel] = density_work[at + i * wide + channel]
+            if has_offset:
+                through_layers(zero, n, n, len(offset_plan), inputs, row * columns, columns, one,
+                               offset, offset_plan, no_rows, no_group, offset_work)  # fmt: skip
+                at, wide = offset_plan[-1, HIDDEN], offset_plan[-1, OUT_PAD]
+                for i in range(n):
+                    inputs[(row + i) * columns + embedding] += offset_work[at + i * wide]
+            for i in range(n):
+                raw = inputs[(row + i) * columns + embedding]
+                raw += _untrained(places[DISTANCE, begin + i], untrained)
+                density = np.exp(min(raw, untrained[4])) * np.float32(1e3)
+                if count == 1:
+                    sigma[begin + i] = density
+                else:
+                    parts[row + i] = density
+    if count > 1:
+        _mix(start, stop, mixing, places, parts, sigma)
 
 
 @njit(**INLINE)

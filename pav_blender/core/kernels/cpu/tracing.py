@@ -280,9 +280,10 @@ def _ask_rest(living, alive, chosen, runs, asked, count):
 
 
 @njit(**INLINE)
-def _add_up(a, ray, chosen, runs, asked, sigma, step, left, depth, negligible, row, showing, shown,
-            shown_row, shown_weight):  # fmt: skip
-    """One ray through its samples: what is left of it, its depth, and how many samples show."""
+def _add_up(a, ray, chosen, runs, asked, sigma, parts, appearances, step, left, depth, negligible,
+            row, showing, shown, shown_row, shown_weight):  # fmt: skip
+    """One ray through its samples: what is left of it, its depth, and how many samples show, each
+    once an appearance."""
     lengths, middle, before, after = runs[1], runs[2], runs[3], runs[4]
     want_k, sample_of = asked[1], asked[2]
     for slot in range(chosen[a]):
@@ -310,9 +311,13 @@ def _add_up(a, ray, chosen, runs, asked, sigma, step, left, depth, negligible, r
             depth += seen * (np.float32(want_k[request]) + np.float32(0.5)) * step
             left -= seen
             if seen > negligible * length:
-                shown[showing], shown_row[showing] = s, row
-                shown_weight[showing] = seen
-                showing += 1
+                for k in range(appearances):
+                    place_of = k * len(sigma) + s
+                    part = parts[place_of] if appearances > 1 else np.float32(1)
+                    if part > 0:
+                        shown[showing], shown_row[showing] = place_of, row
+                        shown_weight[showing] = seen * part
+                        showing += 1
     return left, depth, showing
 
 
@@ -342,11 +347,12 @@ def _trace(total, walked, space, frames, views, field, lengths_of, limits, outpu
     # distances (`frozen`)
     samples = np.zeros(room, np.int32), np.zeros((PLACES, room), np.float32)
     features = features_for(field, most)
-    inputs = np.zeros(room * columns, np.float32)
-    sigma = np.zeros(room, np.float32)
-    shown = np.zeros(room, np.int32)
-    shown_row = np.zeros(room, np.int32)
-    shown_weight = np.zeros(room, np.float32)
+    appearances = field[5][0]
+    inputs = np.zeros(appearances * room * columns, np.float32)
+    sigma, parts = np.zeros(room, np.float32), np.zeros(appearances * room, np.float32)
+    shown = np.zeros(appearances * room, np.int32)
+    shown_row = np.zeros(appearances * room, np.int32)
+    shown_weight = np.zeros(appearances * room, np.float32)
     lit = np.zeros((BLOCK + ROOM) * columns, np.float32)
     colour_work = workspace(field[2][0])
     evaluations = 0
@@ -377,15 +383,17 @@ def _trace(total, walked, space, frames, views, field, lengths_of, limits, outpu
                 begin = count
                 count = _find(known, requests, base, asked, begin, rays, surface, grid, frames,
                               feet, samples)  # fmt: skip
-                densities(begin, count, field, mesh_corners, samples, features, inputs, sigma)
+                densities(begin, count, field, mesh_corners, samples, features, inputs, sigma,
+                          parts)  # fmt: skip
             evaluations += count
             showing, going_on = 0, 0
             for a in range(living):
                 row = alive[a]
                 ray = base + row
                 out_left[ray], out_depth[ray], showing = _add_up(
-                    a, ray, chosen, runs, asked, sigma, step, out_left[ray], out_depth[ray],
-                    negligible, row, showing, shown, shown_row, shown_weight)  # fmt: skip
+                    a, ray, chosen, runs, asked, sigma, parts, appearances, step, out_left[ray],
+                    out_depth[ray], negligible, row, showing, shown, shown_row,
+                    shown_weight)  # fmt: skip
                 first[ray] = following[a]
                 if following[a] <= last[ray] and out_left[ray] > transmittance:
                     alive[going_on] = row

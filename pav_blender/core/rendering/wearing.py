@@ -1,0 +1,183 @@
+"""What an avatar wears in a picture, one appearance or several by shares, and where it may be."""
+
+from __future__ import annotations
+
+import weakref
+from collections import OrderedDict
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy import ndimage
+
+from ..deformation import Clearance, Deformer, clearance
+from ..errors import InputError
+from ..field.avatar import Avatar
+from ..field.field import Worn
+from ..field.mixture import Mixture
+from .guide import guide, neighbourhood
+
+Appearance = str | Mapping[str, float | np.ndarray]
+_KEPT = 4  # mixtures remembered an avatar
+_SOME = 1e-3  # a share below which an appearance is taken not to be there
+_CLOSE, _AWAY = 0.005, 0.03  # metres from the mesh between which shares begin to blur
+_BLUR = 0.012  # metres, the deviation
+
+
+@dataclass(frozen=True, eq=False)
+class Wearing:
+    """The appearances worn, where they fill canonical space, and the greatest density (1/m) to
+    expect in each of its cells [G, G, G]; mixture: None for one appearance alone."""
+
+    worn: Worn
+    mixture: Mixture | None
+    space: Clearance
+    guide: torch.Tensor
+
+
+_deformers: weakref.WeakKeyDictionary[Avatar, Deformer] = weakref.WeakKeyDictionary()
+_spaces: weakref.WeakKeyDictionary[Avatar, dict[int, Clearance]] = weakref.WeakKeyDictionary()
+_guides: weakref.WeakKeyDictionary[Avatar, dict[int, torch.Tensor]] = weakref.WeakKeyDictionary()
+_nearest: weakref.WeakKeyDictionary[Avatar, tuple[np.ndarray, ...]] = weakref.WeakKeyDictionary()
+_mixed: weakref.WeakKeyDictionary[Avatar, OrderedDict[tuple[tuple[int, ...], bytes], Wearing]] = (
+    weakref.WeakKeyDictionary()
+)
+
+
+def wearing_of(avatar: Avatar, appearance: Appearance) -> Wearing:
+    """An appearance by name, or several, each by a weight or by one at every vertex [V].
+
+    Only the weights' proportions count. InputError for unknown names, and for weights that are
+    negative, not finite, or all nothing at some vertex.
+    """
+    rows, shares = shares_of(avatar, appearance)
+    if len(rows) == 1:
+        row = rows[0]
+        return Wearing(
+            avatar.field.wearing([row]), None, space_of(avatar, row), guide_of(avatar, row)
+        )
+    known = _mixed.setdefault(avatar, OrderedDict())
+    key = rows, shares.tobytes()
+    if key not in known:
+        known[key] = _mix(avatar, rows, shares)
+        while len(known) > _KEPT:
+            known.popitem(last=False)
+    known.move_to_end(key)
+    return known[key]
+
+
+def shares_of(avatar: Avatar, appearance: Appearance) -> tuple[tuple[int, ...], np.ndarray]:
+    """Rows of the appearances that are worn anywhere, rising, and their shares [V, K] float32."""
+    chosen = {appearance: 1.0} if isinstance(appearance, str) else dict(appearance)
+    vertices = len(avatar.canonical_vertices)
+    weights = np.zeros((vertices, len(avatar.appearances)), np.float32)
+    for name, weight in chosen.items():
+        given = np.asarray(weight, np.float32)
+        if given.shape not in ((), (vertices,)):
+            raise InputError(
+                f"weights of appearance {name!r}: {list(given.shape)}; a number or [{vertices}], "
+                "one a vertex, are needed"
+            )
+        weights[:, avatar.appearance_index(name)] += given
+    total = weights.sum(1, keepdims=True)
+    if not (np.isfinite(weights).all() and (weights >= 0).all() and (total > 0).all()):
+        raise InputError(
+            f"weights of appearances {', '.join(chosen)}: finite, none negative, and at every "
+            "vertex one above 0"
+        )
+    shares = weights / total
+    shares[shares < _SOME] = 0
+    rows = np.flatnonzero(shares.any(0))
+    shares = shares[:, rows]
+    return tuple(rows.tolist()), np.ascontiguousarray(shares / shares.sum(1, keepdims=True))
+
+
+def _mix(avatar: Avatar, rows: tuple[int, ...], shares: np.ndarray) -> Wearing:
+    filled = torch.from_numpy(avatar.occupied[list(rows)])
+    spread = torch.from_numpy(_in_space(avatar, shares))
+    present = neighbourhood(spread) > 0
+    # a mixture is nowhere denser than the densest of what is mixed there
+    guides = torch.stack([guide_of(avatar, row) for row in rows])
+    return Wearing(
+        avatar.field.wearing(list(rows)),
+        Mixture(spread, filled),
+        clearance_of((filled & present).any(0).numpy(), avatar.box_min, avatar.box_size),
+        torch.where(present, guides, 0).amax(0),
+    )
+
+
+def _in_space(avatar: Avatar, shares: np.ndarray) -> np.ndarray:
+    """Shares at vertices [V, K] -> at cells [K, G, G, G], or [K, 1, 1, 1] if all are the same.
+
+    On the mesh a cell's are those of its nearest point; away from it, where the nearest point leaps
+    from one part of the mesh to another, they are blurred.
+    """
+    if (shares == shares[:1]).all():
+        return shares[0, :, None, None, None]
+    cells, corners, weights, distance = _nearest_points(avatar)
+    size = avatar.occupied.shape[1]
+    here = tuple(cells.T)
+    sharp = np.zeros((shares.shape[1], size, size, size), np.float32)
+    sharp[:, *here] = (shares[corners] * weights[..., None]).sum(1).T
+    known = np.zeros((size, size, size), np.float32)
+    known[here] = 1
+    blur = _BLUR * size / avatar.box_size
+    near = np.maximum(ndimage.gaussian_filter(known, blur), 1e-9)
+    soft = np.stack([ndimage.gaussian_filter(grid, blur) for grid in sharp]) / near
+    away = np.ones_like(known)
+    away[here] = np.clip((distance - _CLOSE) / (_AWAY - _CLOSE), 0, 1)
+    spread = (1 - away) * sharp + away * soft
+    spread[spread < _SOME] = 0
+    total = spread.sum(0)
+    spread[0] += total == 0  # nothing is there
+    return spread / spread.sum(0)
+
+
+def _nearest_points(avatar: Avatar) -> tuple[np.ndarray, ...]:
+    """Cells [N, 3] that anything fills; of the mesh's points nearest to their middles the vertices
+    [N, 3], their weights [N, 3], and the distances [N]. Computed once."""
+    if avatar not in _nearest:
+        cells = np.argwhere(avatar.occupied.any(0))
+        points = (cells + 0.5) / avatar.occupied.shape[1] * avatar.box_size + avatar.box_min
+        deformer = deformer_of(avatar)
+        mesh = deformer.pose(avatar.canonical_vertices)
+        found = deformer.nearest(mesh, torch.from_numpy(points).float())
+        triangle, weights, distance = (values.numpy() for values in found)
+        _nearest[avatar] = cells, avatar.triangles[triangle], weights, distance
+    return _nearest[avatar]
+
+
+def deformer_of(avatar: Avatar) -> Deformer:
+    """The avatar's deformer, built once."""
+    if avatar not in _deformers:
+        _deformers[avatar] = Deformer(
+            avatar.canonical_vertices, avatar.triangles, avatar.config.frames
+        )
+    return _deformers[avatar]
+
+
+def space_of(avatar: Avatar, row: int) -> Clearance:
+    """Where an appearance fills space, computed once."""
+    known = _spaces.setdefault(avatar, {})
+    if row not in known:
+        known[row] = clearance_of(avatar.occupied[row], avatar.box_min, avatar.box_size)
+    return known[row]
+
+
+def guide_of(avatar: Avatar, row: int) -> torch.Tensor:
+    """The density (1/m) of each cell [G, G, G] in an appearance, computed once."""
+    known = _guides.setdefault(avatar, {})
+    if row not in known:
+        worn = avatar.field.wearing([row])
+        known[row] = guide(avatar, deformer_of(avatar), worn, avatar.occupied[row])
+    return known[row]
+
+
+def clearance_of(occupied: np.ndarray, box_min: np.ndarray, box_size: float) -> Clearance:
+    """The clearance grid of cells [G, G, G] bool over a cube."""
+    return Clearance(
+        torch.from_numpy(clearance(occupied)),
+        torch.from_numpy(np.asarray(box_min, np.float32)),
+        1 / box_size,
+    )
