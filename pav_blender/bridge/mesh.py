@@ -33,6 +33,25 @@ def evaluated_vertices(evaluated: Any) -> np.ndarray:
     return vertices(evaluated.data)
 
 
+def group_weights(object_: Any, index: int) -> np.ndarray:
+    """Weights [V] float32 of one vertex group of a mesh object."""
+    weights = np.zeros(len(object_.data.vertices), np.float32)
+    for vertex in object_.data.vertices:
+        for member in vertex.groups:
+            if member.group == index:
+                weights[vertex.index] = member.weight
+    return weights
+
+
+def add_group(object_: Any, name: str, weights: np.ndarray) -> None:
+    """Adds a vertex group with weights [V]; vertices of weight 0 stay outside."""
+    group = object_.vertex_groups.new(name=name)
+    members = np.flatnonzero(weights > 0)
+    for weight in np.unique(weights[members]):
+        chosen = members[weights[members] == weight]
+        group.add(chosen.tolist(), float(weight), "REPLACE")
+
+
 def placement(matrix_world: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     """Splits an object's `matrix_world` [4, 4] into what an avatar is rendered with.
 

@@ -8,7 +8,7 @@ from typing import Any
 import bpy
 
 from ..core.errors import PavError
-from . import avatars
+from . import avatars, thumbnails
 
 QUALITIES = (
     ("PREVIEW", "Preview", "Coarse and fast"),
@@ -22,21 +22,25 @@ if bpy.app.version >= (4, 5):
     _RELATIVE.add("PATH_SUPPORTS_BLEND_RELATIVE")
 
 # Blender keeps pointers to the strings of a dynamic enum: they must stay alive here
-_items: dict[tuple[str, ...], list[tuple[str, str, str, int]]] = {}
+_items: dict[tuple[Any, Any], list[tuple[str, str, str, int, int]]] = {}
 
 
-def appearance_items(self: Any, _context: Any) -> list[tuple[str, str, str, int]]:
+def appearance_items(self: Any, _context: Any) -> list[tuple[str, str, str, int, int]]:
     """Menu of the appearances of an object's avatar; empty when the file cannot be read."""
+    head = self.id_data.pav  # self may be one of its layers
     try:
-        path = avatars.resolve(self.avatar, self.id_data.library) if self.avatar else None
+        path = avatars.resolve(head.avatar, self.id_data.library) if head.avatar else None
         names = tuple(avatars.header(path)["appearances"]) if path else ()
     except (PavError, ImportError):
-        names = ()
-    if names not in _items:
-        _items[names] = [
-            (name, name, f"Render the avatar as in {name}", avatars.number(name)) for name in names
+        path, names = None, ()
+    icons = tuple(thumbnails.icons(path, names)) if path else ()
+    key = names, icons
+    if key not in _items:
+        _items[key] = [
+            (name, name, f"Render the avatar as in {name}", icon, avatars.number(name))
+            for name, icon in zip(names, icons, strict=True)
         ]
-    return _items[names]
+    return _items[key]
 
 
 def clip_names(self: Any, _context: Any, edit_text: str) -> list[str]:
@@ -62,6 +66,34 @@ def _redraw(self: Any, _context: Any) -> None:
     self.id_data.update_tag()
 
 
+class PavLayer(bpy.types.PropertyGroup):
+    """An appearance worn over the head's own, everywhere or in a region."""
+
+    appearance: bpy.props.EnumProperty(  # type: ignore[valid-type]
+        name="Appearance",
+        description="The appearance that this layer shows",
+        items=appearance_items,
+        override={"LIBRARY_OVERRIDABLE"},
+        update=_redraw,
+    )
+    weight: bpy.props.FloatProperty(  # type: ignore[valid-type]
+        name="Weight",
+        description="How much the layer hides what lies below it",
+        min=0.0,
+        max=1.0,
+        default=1.0,
+        subtype="FACTOR",
+        override={"LIBRARY_OVERRIDABLE"},
+        update=_redraw,
+    )
+    region: bpy.props.StringProperty(  # type: ignore[valid-type]
+        name="Region",
+        description="Vertex group whose weights say where; the whole head if empty",
+        override={"LIBRARY_OVERRIDABLE"},
+        update=_redraw,
+    )
+
+
 class PavObject(bpy.types.PropertyGroup):
     """An object with an avatar file is rendered as that avatar."""
 
@@ -79,6 +111,16 @@ class PavObject(bpy.types.PropertyGroup):
         items=appearance_items,
         override={"LIBRARY_OVERRIDABLE"},
         update=_redraw,
+    )
+
+    layers: bpy.props.CollectionProperty(  # type: ignore[valid-type]
+        name="Layers",
+        description="Appearances over the head's own, the last on top",
+        type=PavLayer,
+        override={"LIBRARY_OVERRIDABLE", "USE_INSERTION"},
+    )
+    active_layer: bpy.props.IntProperty(  # type: ignore[valid-type]
+        name="Active Layer", min=0, override={"LIBRARY_OVERRIDABLE"}, options=set()
     )
 
     camera: bpy.props.PointerProperty(  # type: ignore[valid-type]
@@ -113,7 +155,7 @@ class PavScene(bpy.types.PropertyGroup):
     )
 
 
-classes = (PavObject, PavScene)
+classes = (PavLayer, PavObject, PavScene)
 
 
 def register() -> None:
@@ -130,5 +172,6 @@ def unregister() -> None:
     del bpy.types.Object.pav
     for class_ in reversed(classes):
         bpy.utils.unregister_class(class_)
+    thumbnails.forget()
     _items.clear()
     avatars.forget()

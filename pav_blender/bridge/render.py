@@ -11,6 +11,7 @@ import numpy as np
 from ..core.errors import InputError
 from ..core.rendering.colour import linear_premultiplied
 from . import avatars
+from .looks import worn
 from .shot import Actor, Shot
 
 FAR = 1e10  # Blender's depth where nothing is
@@ -90,7 +91,7 @@ def _draw_actor(
         avatar,
         actor.vertices,
         actor.seen_by(shot.camera),
-        actor.appearance or avatar.appearances[0],
+        worn(actor.appearance or avatar.appearances[0], actor.layers),
         settings,
         region=shot.region,
         progress=progress,

@@ -13,6 +13,7 @@ import numpy as np
 
 from ..core.head import HeadModel
 from .axes import points_to_blender
+from .mesh import add_group
 
 REGION_PREFIX = "region."
 CORRECTIVE_PREFIX = "corrective."
@@ -41,9 +42,9 @@ def build_rig(head: HeadModel, betas: np.ndarray, name: str, collection: Any) ->
     modifier.use_deform_preserve_volume = False
     mesh.parent = armature
     for joint, weights in zip(head.joint_names, head.skinning_weights.T, strict=True):
-        _add_group(mesh, joint, weights)
+        add_group(mesh, joint, weights)
     for region, members in head.regions.items():
-        _add_group(mesh, REGION_PREFIX + region, members.astype(np.float32))
+        add_group(mesh, REGION_PREFIX + region, members.astype(np.float32))
     _drive_correctives(head, mesh, armature)
     return Rig(mesh, armature)
 
@@ -90,14 +91,6 @@ def _add_key(object_: Any, name: str, points: np.ndarray) -> None:
     key.value = 0.0  # Blender 5 starts keys at 1
     flat = np.ascontiguousarray(points_to_blender(points), np.float32).ravel()
     key.data.foreach_set("co", flat)
-
-
-def _add_group(object_: Any, name: str, weights: np.ndarray) -> None:
-    group = object_.vertex_groups.new(name=name)
-    members = np.flatnonzero(weights > 0)
-    for weight in np.unique(weights[members]):
-        chosen = members[weights[members] == weight]
-        group.add(chosen.tolist(), float(weight), "REPLACE")
 
 
 def _build_armature(head: HeadModel, betas: np.ndarray, name: str, collection: Any) -> Any:

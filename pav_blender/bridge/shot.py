@@ -13,13 +13,15 @@ from ..core.rendering.cameras import Camera
 from . import avatars, mesh
 from .axes import camera_to_core
 from .lens import frame_size, from_projection
+from .looks import Layer, read_layers
 
 
 @dataclass(frozen=True, eq=False)
 class Actor:
     """A head to draw. vertices [V, 3] float32 metres in the head's own space, which `rigid` and
     `scale` place in the world (see `mesh.placement`); expression: shape key values by name;
-    triangles [T, 3] for the check against the avatar; appearance None: the avatar's first."""
+    triangles [T, 3] for the check against the avatar; appearance None: the avatar's first; layers:
+    what is worn over it."""
 
     name: str
     avatar: Path
@@ -29,6 +31,7 @@ class Actor:
     expression: dict[str, float]
     rigid: np.ndarray
     scale: float
+    layers: tuple[Layer, ...] = ()
 
     def equals(self, other: Actor) -> bool:
         """Whether both would give the same picture."""
@@ -38,6 +41,8 @@ class Actor:
             and np.array_equal(self.rigid, other.rigid)
             and np.array_equal(self.vertices, other.vertices)
             and np.array_equal(self.triangles, other.triangles)
+            and len(self.layers) == len(other.layers)
+            and all(a.equals(b) for a, b in zip(self.layers, other.layers, strict=True))
         )
 
     def seen_by(self, camera: Camera) -> Camera:
@@ -149,6 +154,7 @@ def read_actor(evaluated: Any, matrix_world: Any, depsgraph: Any) -> Actor:
         expression=_key_values(original, depsgraph),
         rigid=rigid,
         scale=scale,
+        layers=read_layers(evaluated),
     )
 
 

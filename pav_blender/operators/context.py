@@ -6,6 +6,8 @@ from typing import Any
 
 import bpy
 
+from ..core.errors import InputError
+
 
 def find_head(context: Any) -> Any | None:
     """The active object if it is a head, else the head that the active object deforms or holds,
@@ -19,6 +21,14 @@ def find_head(context: Any) -> Any | None:
                 return child
     heads = [object_ for object_ in context.scene.objects if object_.pav.avatar]
     return heads[0] if len(heads) == 1 else None
+
+
+def chosen_head(context: Any) -> Any:
+    """What `find_head` finds. InputError where there is none."""
+    head = find_head(context)
+    if head is None:
+        raise InputError("no head to work on: select one that has an avatar")
+    return head
 
 
 def object_mode(context: Any) -> None:
