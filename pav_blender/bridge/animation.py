@@ -10,13 +10,14 @@ from typing import Any
 from ..core.errors import InputError, PavError
 from ..core.progress import Report
 from ..core.rendering.sequence import numbered
-from .scene import _blender, choose_appearance
+from .scene import _blender, wear_only
 
 
 def render_blend(
-    blend: Path, appearance: str, out: str, *, progress: Report | None = None
+    blend: Path, appearance: str | None, out: str, *, progress: Report | None = None
 ) -> list[Path]:
-    """Renders the frame range of a .blend wearing `appearance` ("all": each); returns the paths.
+    """Renders the frame range of a .blend wearing `appearance` alone ("all": each in turn; None:
+    what the scene says, layers and keyframes and all); returns the paths.
 
     Every picture is rendered in a temporary folder beside its place and moved there whole. Raises
     InputError for a file without an avatar or an unknown appearance, PavError where Blender
@@ -38,14 +39,15 @@ def render_blend(
         if not heads:
             raise InputError(f"{blend}: no object in it wears an avatar; see `pav scene`")
         known = avatars.load(Path(bpy.path.abspath(heads[0].pav.avatar))).appearances
-        names = known if appearance == "all" else [appearance]
+        names: list[str | None] = [*known] if appearance == "all" else [appearance]
         written: list[Path] = []
         total = len(names) * (scene.frame_end - scene.frame_start + 1)
         for name in names:
-            for head in heads:
-                choose_appearance(head, known, name)
+            if name is not None:
+                for head in heads:
+                    wear_only(head, known, name)
             for frame in range(scene.frame_start, scene.frame_end + 1):
-                path = numbered(out.replace("{appearance}", name), frame)
+                path = numbered(out.replace("{appearance}", name or "scene"), frame)
                 _render_frame(scene, frame, path)
                 written.append(path)
                 if progress:

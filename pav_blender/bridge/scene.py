@@ -12,6 +12,7 @@ import numpy as np
 
 from ..core.errors import InputError
 from .lens import from_intrinsics
+from .motion import curves
 
 ENGINE = "PAV"
 
@@ -59,6 +60,20 @@ def choose_appearance(mesh: Any, known: list[str], name: str) -> None:
     """Sets the appearance of a head object whose avatar has the appearances `known`."""
     check_appearance(known, name)
     mesh.pav.appearance = name
+
+
+def wear_only(mesh: Any, known: list[str], name: str) -> None:
+    """Makes a head wear one appearance throughout: no layers, no keyframes of either."""
+    check_appearance(known, name)
+    mesh.pav.layers.clear()
+    if mesh.animation_data is not None:
+        for driver in [d for d in mesh.animation_data.drivers if d.data_path.startswith("pav.")]:
+            mesh.animation_data.drivers.remove(driver)
+        if mesh.animation_data.action is not None:
+            found = curves(mesh)
+            for curve in [c for c in found if c.data_path.startswith("pav.")]:
+                found.remove(curve)
+    choose_appearance(mesh, known, name)
 
 
 def stored_path(path: Path, blend: str) -> str:

@@ -18,7 +18,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--track", metavar="COLLECTION:CLIP", help="the motion; a .blend has its own"
     )
-    parser.add_argument("--appearance", required=True, help="a name, or all")
+    parser.add_argument(
+        "--appearance",
+        help="a name, a blend such as old=0.3,young=0.7, or all; a .blend's own if left out",
+    )
     parser.add_argument(
         "--out", required=True, help="pictures: #### is the frame number, {appearance} the name"
     )
@@ -38,6 +41,8 @@ def run(args: argparse.Namespace) -> int:
 
     if not args.track:
         raise InputError("--track is missing: COLLECTION:CLIP, the motion to render")
+    if args.appearance is None:
+        raise InputError("--appearance is missing: the name of one that the avatar has, or all")
     written = render_track(
         args.avatar,
         args.track,

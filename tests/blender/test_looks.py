@@ -9,6 +9,7 @@ import small
 bpy = pytest.importorskip("bpy")
 
 from pav_blender.bridge import looks, thumbnails  # noqa: E402
+from pav_blender.bridge.animation import render_blend  # noqa: E402
 from pav_blender.bridge.looks import Layer, worn  # noqa: E402
 from pav_blender.bridge.scene import build_scene  # noqa: E402
 from pav_blender.bridge.sequence import read_frame  # noqa: E402
@@ -164,6 +165,20 @@ def test_layers_are_saved_and_duplicated(made, files, tmp_path):
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "kept.blend"))
     layer = bpy.data.objects[name].pav.layers[0]
     assert (layer.appearance, layer.region, layer.weight) == ("evening", "area.beard", 0.25)
+
+
+def test_a_blend_file_renders_as_it_is_or_in_one_appearance(made, tmp_path):
+    layer = made.mesh.pav.layers.add()
+    layer.appearance, layer.weight = "evening", 0.5
+    made.mesh.pav.keyframe_insert("appearance", frame=3)
+    layer.keyframe_insert("weight", frame=3)
+    bpy.context.scene.frame_end = 3
+    blend = tmp_path / "kept.blend"
+    bpy.ops.wm.save_as_mainfile(filepath=str(blend), copy=True)
+    expected = [core(made, {"morning": 0.5, "evening": 0.5}), core(made, "evening")]
+    for appearance, rgba in zip((None, "evening"), expected, strict=True):
+        (written,) = render_blend(blend, appearance, str(tmp_path / f"{appearance}.png"))
+        assert_same(images.read_rgba(written) / 255, rgba)
 
 
 def test_thumbnails_show_each_appearance(files):

@@ -13,7 +13,8 @@ from scipy.spatial import cKDTree
 from ..errors import InputError
 
 _EDGE = 0.012  # metres over which an area ends
-_HAIR, _CLOTHES = 0.028, 0.04  # metres beside the scalp, the torso
+_HAIR = 0.06  # metres beside the scalp
+_TEMPLES = 0.02  # metres before the ears
 
 
 def area(name: str, vertices: np.ndarray, regions: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -41,12 +42,12 @@ def _beside(vertices: np.ndarray, members: np.ndarray, reach: float) -> np.ndarr
 
 
 def _hair(vertices: np.ndarray, regions: Regions) -> np.ndarray:
-    """About the scalp: all of it behind the ears, and what lies above the eyes before them."""
+    """About the scalp: all from the temples back, and what lies above the eyes before them."""
     near = _beside(vertices, regions["scalp"], _HAIR)
     eyes = vertices[regions["eyeballs"], 1].mean()
     ears = vertices[regions["ears"], 2].mean()
-    above = np.clip((vertices[:, 1] - eyes - _EDGE) / _EDGE, 0, 1)
-    behind = np.clip((ears - vertices[:, 2]) / _EDGE + 0.5, 0, 1)
+    above = np.clip((vertices[:, 1] - eyes) / _EDGE, 0, 1)
+    behind = np.clip((ears + _TEMPLES - vertices[:, 2]) / _EDGE + 0.5, 0, 1)
     return near * np.maximum(above, behind)
 
 
@@ -60,12 +61,13 @@ def _beard(vertices: np.ndarray, regions: Regions) -> np.ndarray:
 
 
 def _clothes(vertices: np.ndarray, regions: Regions) -> np.ndarray:
-    """The torso and the lower neck."""
-    return _beside(vertices, regions["torso"], _CLOTHES) * (1 - _hair(vertices, regions))
+    """Torso and neck: collars stand as high as the chin."""
+    low = regions["torso"] | regions["neck"]
+    return _beside(vertices, low, 0.0) * (1 - _hair(vertices, regions))
 
 
 AREAS: dict[str, tuple[tuple[str, ...], Callable[[np.ndarray, Regions], np.ndarray]]] = {
     "hair": (("scalp", "eyeballs", "ears"), _hair),
     "beard": (("face", "lips", "eyeballs"), _beard),
-    "clothes": (("torso", "scalp", "eyeballs", "ears"), _clothes),
+    "clothes": (("torso", "neck", "scalp", "eyeballs", "ears"), _clothes),
 }
