@@ -1,11 +1,12 @@
 # make demo: the main job on the built-in default. make test: everything that is checked.
-# Both make .venv first. Another interpreter: make PYTHON=python3.13 test
+# Both make .venv first. make test-52: the same on Python 3.13 with bpy 5.2
 PYTHON ?= python3.11
+PYTHON52 ?= python3.13
 VENV ?= .venv
 RUN = $(VENV)/bin/python
 OUT ?= out
 
-.PHONY: demo test test-all lint extension test-real-blender clean
+.PHONY: demo test test-52 test-all lint extension test-real-blender clean
 
 demo: $(VENV)/ready
 	$(RUN) -m pav_blender doctor --compile
@@ -13,6 +14,9 @@ demo: $(VENV)/ready
 
 test: $(VENV)/ready lint extension
 	$(RUN) -m pytest tests --durations=10
+
+test-52:
+	$(MAKE) PYTHON=$(PYTHON52) VENV=.venv52 test
 
 test-all: $(VENV)/ready lint extension
 	PAV_SLOW=1 $(RUN) -m pytest tests --durations=20

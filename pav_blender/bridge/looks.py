@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import InputError
-from ..core.head.areas import area
 from . import avatars, mesh
-from .rig import REGION_PREFIX
 
 AREA_PREFIX = "area."
+AREAS = ("hair", "beard", "clothes")  # of `core.head.areas`, which takes torch to load
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +77,9 @@ def read_layers(evaluated: Any) -> tuple[Layer, ...]:
 def add_area(object_: Any, name: str) -> str:
     """A vertex group with an area of a head (`core.head.areas`), ready to be painted over; returns
     its name. A group of that name that is there stays as it is."""
+    from ..core.head.areas import area
+    from .rig import REGION_PREFIX
+
     called = AREA_PREFIX + name
     if called in object_.vertex_groups:
         return called

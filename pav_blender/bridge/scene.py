@@ -12,7 +12,6 @@ import numpy as np
 
 from ..core.errors import InputError
 from .lens import from_intrinsics
-from .motion import curves
 
 ENGINE = "PAV"
 
@@ -64,6 +63,8 @@ def choose_appearance(mesh: Any, known: list[str], name: str) -> None:
 
 def wear_only(mesh: Any, known: list[str], name: str) -> None:
     """Makes a head wear one appearance throughout: no layers, no keyframes of either."""
+    from .motion import curves
+
     check_appearance(known, name)
     mesh.pav.layers.clear()
     if mesh.animation_data is not None:

@@ -8,7 +8,6 @@ import bpy
 
 from ..bridge import looks
 from ..core.errors import InputError
-from ..core.head.areas import AREAS
 from .context import chosen_head, find_head
 from .reporting import reporting
 
@@ -32,7 +31,7 @@ class PAV_OT_add_layer(_OfHead, bpy.types.Operator):
         description="Where; a vertex group with soft edges is made, to be painted over",
         items=[
             ("NONE", "Whole Head", "Blend with the appearance below"),
-            *((name.upper(), name.title(), f"The {name} alone") for name in AREAS),
+            *((name.upper(), name.title(), f"The {name} alone") for name in looks.AREAS),
         ],
     )
 

@@ -28,7 +28,11 @@ def configure(scene, size: int) -> None:
     render.film_transparent = True
     render.dither_intensity = 0.0
     render.use_compositing = render.use_sequencer = False
+    if hasattr(render.image_settings, "media_type"):  # Blender 5: formats depend on it
+        render.image_settings.media_type = "MULTI_LAYER_IMAGE"
     render.image_settings.file_format = "OPEN_EXR_MULTILAYER"
+    if hasattr(render.image_settings, "use_exr_interleave"):  # Blender 5: all layers in one part
+        render.image_settings.use_exr_interleave = True
     render.image_settings.color_depth = "32"
     render.image_settings.exr_codec = "NONE"
     scene.view_settings.view_transform = "Standard"

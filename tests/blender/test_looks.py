@@ -18,6 +18,7 @@ from pav_blender.core.collection import read_collection  # noqa: E402
 from pav_blender.core.errors import InputError  # noqa: E402
 from pav_blender.core.field.avatar import Avatar  # noqa: E402
 from pav_blender.core.head import builtin_head  # noqa: E402
+from pav_blender.core.head.areas import AREAS, area  # noqa: E402
 from pav_blender.core.rendering.cameras import Camera  # noqa: E402
 from pav_blender.core.rendering.render import RenderSettings, render  # noqa: E402
 
@@ -109,7 +110,7 @@ def test_operators_add_move_and_remove_layers(made):
         ("evening", ""),
     ]
     hair = looks.mesh.group_weights(made.mesh, made.mesh.vertex_groups["area.hair"].index)
-    expected = looks.area("hair", builtin_head().shaped(made.avatar.betas), builtin_head().regions)
+    expected = area("hair", builtin_head().shaped(made.avatar.betas), builtin_head().regions)
     np.testing.assert_allclose(hair, expected, atol=2e-3)
     assert bpy.ops.pav.move_layer(down=False) == {"FINISHED"}
     assert [layer.region for layer in pav.layers] == ["", "area.hair"]
@@ -192,6 +193,10 @@ def test_thumbnails_show_each_appearance(files):
     assert thumbnails.icons(files[0], small.APPEARANCES) == [0, 0]  # none without a window
 
 
+def test_the_menu_has_the_areas_there_are():
+    assert tuple(AREAS) == looks.AREAS
+
+
 def test_a_head_without_regions_has_no_areas():
     with pytest.raises(InputError, match="no region 'scalp', which the area 'hair' needs"):
-        looks.area("hair", np.zeros((3, 3)), {})
+        area("hair", np.zeros((3, 3)), {})

@@ -165,7 +165,8 @@ def test_wrong_requests_are_refused(tmp_path):
 
 
 def test_the_committed_collection_renders_again():
-    """Two frames of the default collection: the parameters exactly, the pictures closely."""
+    """Two frames of the default collection: the parameters but for the last bit, which differs
+    between versions of numpy; the pictures closely."""
     collection = read_collection(DEFAULT)
     extra = collection.extra
     assert extra["head_fingerprint"] == collection.head.fingerprint
@@ -176,7 +177,7 @@ def test_the_committed_collection_renders_again():
         shots = render.plan(person, look, extra["frames"], clip.width, extra["seed"])
         for key in ("expression", "pose", "translation", "intrinsics", "camera_to_world"):
             planned = np.stack([getattr(shot, key) for shot in shots]).astype(np.float32)
-            np.testing.assert_array_equal(planned, getattr(clip, key))
+            np.testing.assert_allclose(planned, getattr(clip, key), rtol=1e-6, atol=1e-8)
         with render.filming(person, look, clip.width, extra["seed"]) as take:
             picture = take(shots[row])
         stored = read_rgba(collection.image_path(clip, row)).astype(float)
