@@ -31,9 +31,10 @@ def head_from_object(
 ) -> HeadModel:
     """The head that a mesh object is, named after it.
 
-    Shape keys become expressions (muted ones, and a rig's pose keys, are left out). Bones whose vertex groups hold weights
-    become joints, `joints` renaming some (ours -> theirs: {"jaw": "DEF-jaw"}); where several bones
-    have no parent, or vertices no bone, a root is added that holds them. Vertex groups called
+    Shape keys become expressions (muted ones, and a rig's pose keys, are left out). Bones whose
+    vertex groups hold weights become joints, `joints` renaming some (ours -> theirs: {"jaw":
+    "DEF-jaw"}); where several bones have no parent, or vertices no bone, a root is added that holds
+    them. Vertex groups called
     `region.<name>` become regions, `regions` adding others (ours -> theirs). Without UVs xatlas
     makes an atlas.
 

@@ -13,11 +13,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..core.head import HeadModel
+if TYPE_CHECKING:  # it needs torch
+    from ..core.head import HeadModel
 
 CONTROL_SUFFIX, BACK_SUFFIX = ".pose", ".back"
 _COLLECTION = "Pose keys"  # of bones, hidden

@@ -29,6 +29,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--frames", metavar="A-B", help="frame numbers, e.g. 10-20 or 5")
     parser.add_argument("--depth", action="store_true", help="write EXR with depth (.exr)")
     parser.add_argument("--quality", default="final", help="preview, final or reference")
+    parser.add_argument(
+        "--relative", action="store_true", help="move from the track's neutral, not as it is"
+    )
+    parser.add_argument(
+        "--other-identity", action="store_true", help="yes, the track is another person's"
+    )
     parser.add_argument("--device", default="cpu", help="of the networks: cpu, cuda or mps")
 
 
@@ -53,6 +59,8 @@ def run(args: argparse.Namespace) -> int:
         depth=args.depth,
         quality=args.quality,
         device=args.device,
+        relative=args.relative,
+        other_identity=args.other_identity,
         progress=progress,
     )
     print(f"{len(written)} pictures, the last {written[-1]}")
@@ -65,6 +73,7 @@ def _render_blend(args: argparse.Namespace, progress: Progress) -> int:
     from ..core.rendering.sequence import check_pattern
 
     taken = [name for name in ("track", "size", "frames", "depth") if getattr(args, name)]
+    taken += [n for n in ("relative", "other-identity") if getattr(args, n.replace("-", "_"))]
     taken += ["device"] * (args.device != "cpu")
     if taken:
         raise InputError(f"--{taken[0]} does not go with a .blend: it is set in the scene")

@@ -157,7 +157,9 @@ def total_pose(head, pose, values):
         for name, value in values.items():
             if joint in POSE_KEYS[name].joints:
                 turn[POSE_KEYS[name].axis] += value * POSE_KEYS[name].degrees
-        x, y, z = (Rotation.from_rotvec(a * d, degrees=True) for a, d in zip(turn, np.eye(3)))
+        x, y, z = (
+            Rotation.from_rotvec(a * d, degrees=True) for a, d in zip(turn, np.eye(3), strict=True)
+        )
         total.append((y * x * z * Rotation.from_rotvec(own)).as_rotvec())
     return np.array(total)
 
@@ -263,7 +265,9 @@ def test_heads_without_a_joint_or_with_its_key_go_without_pose_keys(scene, head)
         joint_names=("root", "jaw"),
         joint_parents=(-1, 0),
         joint_positions=head.joints([])[[0, 2]],
-        skinning_weights=np.stack([1 - head.skinning_weights[:, 2], head.skinning_weights[:, 2]], 1),
+        skinning_weights=np.stack(
+            [1 - head.skinning_weights[:, 2], head.skinning_weights[:, 2]], 1
+        ),
     )
     made = rig.build_rig(named, np.zeros(0, np.float32), "Named", scene.collection)
     assert pose_keys(made.mesh, made.armature) == ["jaw_left"]
