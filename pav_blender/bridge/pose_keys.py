@@ -109,7 +109,7 @@ def connect(head: HeadModel, mesh: Any, armature: Any) -> None:
         _follow(head, mesh, armature)
 
 
-_TERMS = 20  # of a sum: a driver's expression ends at 255 characters
+_TERMS = 16  # of a sum: a driver's expression ends at 255 characters
 
 
 def _follow(head: HeadModel, mesh: Any, armature: Any) -> None:
@@ -123,7 +123,7 @@ def _follow(head: HeadModel, mesh: Any, armature: Any) -> None:
                 parts.append(f"{joint} moved {'xyz'[axis]}{start // _TERMS}")
                 armature[parts[-1]] = 0.0
                 driver = armature.driver_add(f'["{parts[-1]}"]').driver
-                terms = []
+                terms: list[str] = []
                 for name, factor in zip(
                     head.expression_names[start:], factors[start : start + _TERMS], strict=False
                 ):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +44,8 @@ def build_head(avatar_path: Path, appearance: str | None = None) -> Any:
         head = head_of(avatar)
     except InputError as error:
         raise InputError(f"{avatar_path}: {error}") from error
+    if head.expression_names != avatar.expression_names:  # another version's names for the same
+        head = replace(head, expression_names=avatar.expression_names)
     rig = build_rig(head, avatar.betas, avatar_path.stem, bpy.context.scene.collection)
     rig.mesh.pav.avatar = stored_path(avatar_path, bpy.data.filepath)
     choose_appearance(rig.mesh, avatar.appearances, name)

@@ -27,7 +27,7 @@ class PAV_OT_pack_avatar(bpy.types.Operator):
     @reporting
     def execute(self, context: Any) -> set[str]:
         requirements.check()
-        head = find_head(context)
+        head: Any = find_head(context)
         path = avatars.path_of(head.pav)
         avatars.header(path)  # what is no avatar is not packed
         packing.pack(head, path)

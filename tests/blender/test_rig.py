@@ -205,6 +205,11 @@ def test_pose_keys_turn_the_joints_with_the_bones(scene, which, request, capfd):
             betas, expression[frame : frame + 1], pose[frame][None], translation[frame : frame + 1]
         )
         assert np.abs(expected - still[0].numpy()).max() > 0.01
+    drivers = [*made.armature.animation_data.drivers]
+    drivers += [*(made.mesh.data.shape_keys.animation_data.drivers)]
+    # short enough to be whole, and simple: evaluated without Python, so in files not trusted too
+    assert all(len(curve.driver.expression) < 250 for curve in drivers)
+    assert all(curve.driver.is_simple_expression for curve in drivers)
     said = capfd.readouterr()
     assert "ycle" not in said.out + said.err  # no dependency cycle
 
