@@ -9,6 +9,7 @@ import numpy as np
 
 from ..core.errors import InputError
 from .motion import Motion, apply_motion
+from .overrides import check_editable
 from .pose_keys import BACK_SUFFIX, CONTROL_SUFFIX
 from .rig import find_armature
 
@@ -27,6 +28,7 @@ def import_take(
     if armature is None or keys is None:
         what = "armature" if armature is None else "shape keys"
         raise InputError(f"object {mesh.name!r} has no {what} to move")
+    check_editable(mesh, armature)
     take = resample(read_take(path, timecode_rate), scene.render.fps / scene.render.fps_base)
     names = tuple(name for name in ARKIT_NAMES if name in keys.key_blocks)
     joints = tuple(

@@ -138,7 +138,10 @@ class PavObject(bpy.types.PropertyGroup):
         type=PavPack, override={"LIBRARY_OVERRIDABLE"}
     )
     camera: bpy.props.PointerProperty(  # type: ignore[valid-type]
-        name="Camera", description="The camera of the imported track", type=bpy.types.Object
+        name="Camera",
+        description="The camera of the imported track",
+        type=bpy.types.Object,
+        override={"LIBRARY_OVERRIDABLE"},
     )
 
 

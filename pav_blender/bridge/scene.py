@@ -104,6 +104,7 @@ def import_track(
     from ..core.collection import relative_clip
     from . import backdrop
     from .motion import Motion, apply_camera, apply_motion
+    from .overrides import check_editable
     from .rig import find_armature
 
     scene = bpy.context.scene
@@ -120,6 +121,7 @@ def import_track(
             f"object {mesh.name!r} has no {what}: clip {clip_name!r} moves the head "
             f"{collection.head_name!r}; import that clip's avatar first"
         )
+    check_editable(mesh, armature)
     rows = filmed_rows(clip)
     frames = clip.frame_id[rows].astype(np.float64)
     motion = Motion(clip.expression[rows], clip.pose[rows], clip.translation[rows], frames)
@@ -212,7 +214,10 @@ def _track_camera(scene: Any, mesh: Any) -> Any:
     import bpy
 
     camera = mesh.pav.camera
-    if camera is None or camera.name not in scene.objects:
+    linked = camera is not None and any(
+        thing.library or thing.override_library for thing in (camera, camera.data)
+    )
+    if camera is None or linked or camera.name not in scene.objects:
         name = f"{mesh.name} camera"
         camera = bpy.data.objects.new(name, bpy.data.cameras.new(name))
         camera.data.clip_start = 0.01

@@ -7,8 +7,8 @@ from typing import Any, ClassVar
 
 import bpy
 
-from ..bridge import avatars, links, packing, requirements
-from .context import find_head
+from ..bridge import avatars, links, overrides, packing, requirements
+from .context import find_head, object_mode, select
 from .reporting import reporting
 
 
@@ -78,5 +78,24 @@ class PAV_OT_relink_avatars(bpy.types.Operator):
         return {"FINISHED"}
 
 
-classes = (PAV_OT_pack_avatar, PAV_OT_unpack_avatar, PAV_OT_relink_avatars)
+class PAV_OT_override_head(bpy.types.Operator):
+    """Make a head that is linked from another file editable here, shape keys and all"""
+
+    bl_idname = "pav.override_head"
+    bl_label = "Override Linked Head"
+    bl_options: ClassVar = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        return context.active_object is not None
+
+    @reporting
+    def execute(self, context: Any) -> set[str]:
+        object_mode(context)
+        head = overrides.override_head(context, context.active_object)
+        select(context, head)
+        return {"FINISHED"}
+
+
+classes = (PAV_OT_pack_avatar, PAV_OT_unpack_avatar, PAV_OT_relink_avatars, PAV_OT_override_head)
 register, unregister = bpy.utils.register_classes_factory(classes)

@@ -25,6 +25,7 @@ class PAV_PT_files(Sidebar, bpy.types.Panel):
         else:
             column.operator("pav.pack_avatar", icon="PACKAGE")
         column.operator("pav.relink_avatars", icon="FILE_REFRESH")
+        column.operator("pav.override_head", icon="LIBRARY_DATA_OVERRIDE")
 
 
 classes = (PAV_PT_files,)

@@ -426,6 +426,56 @@ def test_an_override_keeps_its_edits(library, here):
     np.testing.assert_array_equal(picture(scene), changed)
 
 
+def test_an_overridden_head_can_be_animated(library, here, files):
+    folder, _ = library
+    scene = load(folder, link=True)
+    (instance,) = (o for o in scene.objects if o.instance_type == "COLLECTION")
+    bpy.context.view_layer.objects.active = instance
+    bpy.ops.pav.override_head()
+    (head,) = heads()
+    assert bpy.context.object == head
+    assert head.override_library is not None
+    scene.pav.collection = str(files / "collection")
+    bpy.ops.pav.import_track()
+    assert scene.camera.library is None  # the library's camera stays as it is
+    assert scene.camera.override_library is None
+    block = head.data.shape_keys.key_blocks["neck_turn"]
+    block.value = 0.8
+    block.keyframe_insert("value", frame=6)
+    drawn = picture(scene, 6)
+    posed = evaluated(head)
+    block.value = 0.0
+    save(here / "main.blend")
+    scene = reopen(here / "main.blend")
+    (head,) = heads()
+    assert head.pav.camera == scene.camera
+    np.testing.assert_array_equal(picture(scene, 6), drawn)
+    np.testing.assert_array_equal(evaluated(head), posed)
+    head.data.shape_keys.animation_data.action = None
+    head.data.shape_keys.key_blocks["neck_turn"].value = 0.0
+    assert np.abs(evaluated(head) - posed).max() > 0.02  # the drivers read the override's keys
+    with pytest.raises(RuntimeError, match="not linked from another file"):
+        bpy.ops.pav.override_head()
+
+
+def test_animating_a_linked_head_is_refused(library, here, files):
+    folder, _ = library
+    scene = load(folder, link=True)
+    (instance,) = (o for o in scene.objects if o.instance_type == "COLLECTION")
+    # Blender's own override leaves the shape keys linked: keyframes there would be lost
+    instance.instance_collection.override_hierarchy_create(
+        scene, bpy.context.view_layer, do_fully_editable=True
+    )
+    bpy.data.objects.remove(instance)
+    (head,) = heads()
+    bpy.context.view_layer.objects.active = head
+    scene.pav.collection = str(files / "collection")
+    with pytest.raises(RuntimeError, match="use Override Linked Head first"):
+        bpy.ops.pav.import_track()
+    bpy.ops.pav.override_head()
+    bpy.ops.pav.import_track()
+
+
 def test_a_packed_avatar_comes_along_when_linked_and_appended(scene, files, here):
     save(here / "library.blend")
     head = add(scene, here)
