@@ -58,16 +58,16 @@ def _find(object_: Any, files: list[Path]) -> Path | None:
 
 
 def _fits(object_: Any, path: Path) -> bool:
-    """Whether an avatar file is of a head object's head, and knows the appearance chosen there."""
+    """Whether an avatar file is of a head object's head, and knows the appearances chosen there."""
     try:
         header = avatars.header(path)
     except PavError:
         return False
     keys = object_.data.shape_keys if object_.type == "MESH" else None
     known = set(keys.key_blocks.keys()) if keys is not None else set()
-    chosen = avatars.chosen_number(object_.pav)
+    chosen = {avatars.chosen_number(worn) for worn in (object_.pav, *object_.pav.layers)} - {0}
     return set(header["expression_names"]) <= known and (
-        chosen == 0 or chosen in map(avatars.number, header["appearances"])
+        chosen <= set(map(avatars.number, header["appearances"]))
     )
 
 
