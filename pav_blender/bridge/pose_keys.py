@@ -97,7 +97,7 @@ def connect(head: HeadModel, mesh: Any, armature: Any) -> None:
         control.rotation_mode = _ORDER
         for name, key in keys.items():
             if joint in key.joints:
-                driver = control.driver_add("rotation_euler", key.axis).driver
+                driver = add_driver(control, "rotation_euler", key.axis)
                 _read(driver, "value", "KEY", mesh.data.shape_keys, _path(name))
                 driver.expression = f"value * {math.radians(key.degrees)!r}"
     for name, joint in helpers(head):
@@ -122,7 +122,7 @@ def _follow(head: HeadModel, mesh: Any, armature: Any) -> None:
             for start in range(0, len(factors), _TERMS):
                 parts.append(f"{joint} moved {'xyz'[axis]}{start // _TERMS}")
                 armature[parts[-1]] = 0.0
-                driver = armature.driver_add(f'["{parts[-1]}"]').driver
+                driver = add_driver(armature, f'["{parts[-1]}"]')
                 terms: list[str] = []
                 for name, factor in zip(
                     head.expression_names[start:], factors[start : start + _TERMS], strict=False
@@ -133,7 +133,7 @@ def _follow(head: HeadModel, mesh: Any, armature: Any) -> None:
                 driver.expression = f"({'+'.join(terms)})*1e-6"
             for suffix, sign in ((CONTROL_SUFFIX, ""), (BACK_SUFFIX, "-")):
                 bone = armature.pose.bones[joint + suffix]
-                driver = bone.driver_add("location", axis).driver
+                driver = add_driver(bone, "location", axis)
                 for index, part in enumerate(parts):
                     _read(driver, f"p{index}", "OBJECT", armature, f'["{part}"]')
                 driver.expression = f"{sign}({'+'.join(f'p{i}' for i in range(len(parts)))})"
@@ -158,9 +158,20 @@ def _path(name: str) -> str:
     return f'key_blocks["{name}"].value'
 
 
+def add_driver(owner: Any, path: str, index: int = -1) -> Any:
+    """A scripted driver of a property, whose value is the expression's as it is: Blender 5 gives
+    its curve two keys, and takes what lies close above the first, at 0, for 0."""
+    curve = owner.driver_add(path, index)
+    for point in reversed(curve.keyframe_points):
+        curve.keyframe_points.remove(point)
+    for modifier in reversed(curve.modifiers):
+        curve.modifiers.remove(modifier)
+    curve.driver.type = "SCRIPTED"
+    return curve.driver
+
+
 def _read(driver: Any, name: str, kind: str, id_: Any, path: str) -> None:
-    """Adds a variable of a scripted driver: a property of an ID."""
-    driver.type = "SCRIPTED"
+    """Adds a variable to a driver: a property of an ID."""
     variable = driver.variables.new()
     variable.name = name
     target = variable.targets[0]

@@ -145,8 +145,7 @@ def _drive_correctives(head: HeadModel, mesh: Any, armature: Any) -> None:
     """Pose correctives (FLAME's) follow the bones' rotations, pose keys and all, by drivers."""
     for index in range(len(head.pose_basis)):
         key = mesh.data.shape_keys.key_blocks[f"{CORRECTIVE_PREFIX}{index:03d}"]
-        driver = key.driver_add("value").driver
-        driver.type = "SCRIPTED"
+        driver = pose_keys.add_driver(key, "value")
         for axis in "wxyz":
             variable = driver.variables.new()
             variable.name, variable.type = axis, "TRANSFORMS"
