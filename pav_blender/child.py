@@ -2,17 +2,21 @@
 
 The parent holds the other end of standard input. When that closes (because it wants the work to
 end, or was killed) the verb gets a polite signal to stop, and has a while to save what it has.
+`python -m pav_blender.child pip ...` runs pip in the same way.
 """
 
 from __future__ import annotations
 
 import os
+import runpy
 import signal
 import sys
 import threading
 import time
 
 GRACE_S = 30.0
+PACKAGES = "PAV_PACKAGES"  # folders to look for packages in after all others
+PIP = "PAV_PIP"  # a packed pip, where none is installed
 
 
 def _watch() -> None:
@@ -28,7 +32,13 @@ def _watch() -> None:
 
 
 if __name__ == "__main__":
-    from .cli import main
-
+    sys.path += [entry for entry in os.environ.get(PACKAGES, "").split(os.pathsep) if entry]
     threading.Thread(target=_watch, daemon=True).start()
-    sys.exit(main(sys.argv[1:]))
+    if sys.argv[1:2] == ["pip"]:
+        del sys.argv[0]
+        sys.path[:0] = [entry for entry in [os.environ.get(PIP, "")] if entry]
+        runpy.run_module("pip", run_name="__main__", alter_sys=True)
+    else:
+        from .cli import main
+
+        sys.exit(main(sys.argv[1:]))

@@ -17,6 +17,7 @@ import bpy
 from ..core.errors import PavError
 
 TRAINING, WRITING = "Training", "Writing frames"
+INSTALLING, CHECKING = "Installing", "Checking"
 _INTERVAL_S = 0.2
 
 
@@ -108,7 +109,7 @@ def _tick() -> float | None:
 def _redraw() -> None:
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
-            if area.type in {"VIEW_3D", "PROPERTIES"}:
+            if area.type in {"VIEW_3D", "PROPERTIES", "PREFERENCES"}:
                 area.tag_redraw()
 
 

@@ -1,4 +1,4 @@
-"""A verb of `pav` as a process of its own, read line by line."""
+"""A verb of `pav` (or pip) as a process of its own, read line by line."""
 
 from __future__ import annotations
 
@@ -9,22 +9,43 @@ import subprocess
 import sys
 import threading
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..child import GRACE_S
+from ..child import GRACE_S, PACKAGES
 from ..core.errors import PavError
+from . import packages
 
 _KEPT_LINES = 200
+
+Fields = dict[str, Any]
+
+
+def json_fields(line: str) -> Fields | None:
+    """What a line of `core.progress` says, or None where it is none."""
+    try:
+        said = json.loads(line)
+    except ValueError:
+        return None
+    return said if isinstance(said, dict) else None
 
 
 @dataclass
 class Process:
     """A running `pav VERB ... --json-progress`. `step()` takes in what it said since the last
-    call. It stops when its standard input closes, so it ends with Blender, however that ends."""
+    call, and tells `listen`. It stops when its standard input closes, so it ends with Blender,
+    however that ends. merged: what it prints is read too; understand: line -> fields, or None;
+    measure: tells the part done of work that says nothing of it."""
 
     arguments: list[str]
+    listen: Callable[[Fields], None] | None = None
+    merged: bool = False
+    understand: Callable[[str], Fields | None] = json_fields
+    measure: Callable[[], float] | None = None
+    python: str | None = None  # the chosen one, if None
+    variables: dict[str, str] = field(default_factory=dict)  # of its environment, besides
     fraction: float = 0.0
     message: str = "Starting"
     error: str = ""
@@ -33,19 +54,20 @@ class Process:
     _stopping: bool = False
 
     def __post_init__(self) -> None:
+        python = self.python or interpreter()
         try:
             self._child = subprocess.Popen(
-                [interpreter(), "-m", "pav_blender.child", *self.arguments],
+                [python, "-P", "-m", "pav_blender.child", *self.arguments],
                 stdin=subprocess.PIPE,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.PIPE,
-                env=environment(),
+                stdout=subprocess.PIPE if self.merged else subprocess.DEVNULL,
+                stderr=subprocess.STDOUT if self.merged else subprocess.PIPE,
+                env=environment(python) | self.variables,
                 text=True,
                 encoding="utf-8",
                 errors="replace",
             )
         except OSError as error:
-            raise PavError(f"{interpreter()}: cannot be started ({error.strerror})") from error
+            raise PavError(f"{python}: cannot be started ({error.strerror})") from error
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
 
@@ -58,6 +80,8 @@ class Process:
         over = self.finished
         while not self._said.empty():
             self._take(self._said.get())
+        if self.measure is not None and not over:
+            self.fraction = max(self.fraction, self.measure())
         if over and not self.error and self._child.returncode != 0:
             self.error = self._last_words()
         return over
@@ -71,7 +95,7 @@ class Process:
         self._reader.join()
 
     def stop(self) -> None:
-        """Asks the process to end; it is killed if it has not after a few seconds."""
+        """Asks the process to end; it is killed if it has not after a while."""
         if self._stopping or self._child.poll() is not None:
             return
         self._stopping = True
@@ -87,23 +111,23 @@ class Process:
             self._child.kill()
 
     def _read(self) -> None:
-        assert self._child.stderr is not None
-        for line in self._child.stderr:
+        stream = self._child.stdout if self.merged else self._child.stderr
+        assert stream is not None
+        for line in stream:
             self._said.put(line.rstrip())
 
     def _take(self, line: str) -> None:
         if not line:
             return
-        try:
-            said = json.loads(line)
-        except ValueError:
-            said = None
-        if not isinstance(said, dict):
+        said = self.understand(line)
+        if said is None:
             self.lines.append(line)
             return
         self.fraction = float(said.get("fraction", self.fraction))
         if not self._stopping:
-            self.message = _describe(said)
+            self.message = str(said.get("message") or _describe(said))
+        if self.listen is not None:
+            self.listen(said)
 
     def _last_words(self) -> str:
         last = self.lines[-1] if self.lines else "it said nothing"
@@ -111,10 +135,14 @@ class Process:
             return last[5:]
         if self._stopping:
             return "Cancelled"
-        return f"pav {self.arguments[0]} ended with code {self._child.returncode}: {last}"
+        verb = self.arguments[0]
+        what = verb if verb == "pip" else f"pav {verb}"
+        wrong = [line for line in self.lines if line.startswith("ERROR: ")]  # pip adds advice
+        last = wrong[-1][7:] if wrong else last
+        return f"{what} ended with code {self._child.returncode}: {last}"
 
 
-def _describe(said: dict[str, Any]) -> str:
+def _describe(said: Fields) -> str:
     """One progress line of `core.progress` for a panel: "train 40 %, 1:10 left"."""
     text = f"{said.get('task', '')} {100 * float(said.get('fraction', 0)):.0f} %".strip()
     left = said.get("seconds_left")
@@ -125,15 +153,21 @@ def _describe(said: dict[str, Any]) -> str:
 
 
 def interpreter() -> str:
-    """The Python to run: Blender's own, or the one that imported the bpy wheel."""
-    return sys.executable
+    """The Python to run: the one chosen in the preferences, else Blender's own, or the one that
+    imported the bpy wheel."""
+    return packages.chosen_python() or sys.executable
 
 
-def environment() -> dict[str, str]:
-    """Variables under which that Python finds this package, wherever Blender unpacked it, and
-    what extensions brought along."""
-    parent = Path(__file__).resolve().parents[2]
-    brought = [entry for entry in sys.path if "extensions" in Path(entry).parts]
+def environment(python: str) -> dict[str, str]:
+    """Variables under which a Python finds this package, wherever Blender unpacked it, and, if it
+    is Blender's, what extensions brought along and the folders that were added."""
+    entries = [str(Path(__file__).resolve().parents[2])]
+    variables = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    if python == sys.executable:
+        added = packages.added()
+        brought = (entry for entry in sys.path if "extensions" in Path(entry).parts)
+        entries += [entry for entry in brought if entry not in added]
+        variables[PACKAGES] = os.pathsep.join(added)
     inherited = os.environ.get("PYTHONPATH", "")
-    entries = [str(parent), *brought, *([inherited] if inherited else [])]
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(entries), "PYTHONUNBUFFERED": "1"}
+    variables["PYTHONPATH"] = os.pathsep.join([*entries, *([inherited] if inherited else [])])
+    return variables

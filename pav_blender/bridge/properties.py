@@ -8,7 +8,8 @@ from typing import Any
 import bpy
 
 from ..core.errors import PavError
-from . import avatars, thumbnails
+from . import avatars, thumbnails, training_properties
+from .training_properties import PavTraining
 
 QUALITIES = (
     ("PREVIEW", "Preview", "Coarse and fast"),
@@ -161,18 +162,10 @@ class PavScene(bpy.types.PropertyGroup):
         description="Clip of the collection whose track to import; its first if empty",
         search=clip_names,
     )
-    output: bpy.props.StringProperty(  # type: ignore[valid-type]
-        name="Avatar",
-        description="Avatar file (.pav) to import, or to write by training",
-        subtype="FILE_PATH",
-    )
-    arguments: bpy.props.StringProperty(  # type: ignore[valid-type]
-        name="Options",
-        description="Further options of `pav train`, as on a command line",
-    )
+    training: bpy.props.PointerProperty(type=PavTraining)  # type: ignore[valid-type]
 
 
-classes = (PavLayer, PavPack, PavObject, PavScene)
+classes = (*training_properties.classes, PavLayer, PavPack, PavObject, PavScene)
 
 
 def register() -> None:

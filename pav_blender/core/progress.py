@@ -29,14 +29,16 @@ class Progress:
         self._width = width
         self._start = time.monotonic()
         self._last = -1e9
+        self._first: tuple[float, float] | None = None  # of the first call: time, fraction
 
     def __call__(self, fraction: float, **fields: Any) -> None:
         now = time.monotonic()
+        self._first = self._first or (now, fraction)
         if fraction < 1 and now - self._last < self._interval:
             return
         self._last = now
         seconds = now - self._start
-        left = seconds / fraction - seconds if fraction > 0 else None
+        left = self._left(now, fraction)
         if self._json:
             message = {"task": self.task, "fraction": round(fraction, 5), **fields}
             message["seconds"] = round(seconds, 2)
@@ -52,6 +54,15 @@ class Progress:
             self._write(text + ("\n" if fraction >= 1 else ""))
         else:
             self._write(text + "\n")
+
+    def _left(self, now: float, fraction: float) -> float | None:
+        """Seconds, by the pace since the first call: resumed work begins in its middle."""
+        began, first = self._first or (now, fraction)
+        if first < 0.05:  # from the start: what came before the first call is part of the work
+            began, first = self._start, 0.0
+        if fraction <= first:
+            return 0.0 if fraction >= 1 else None
+        return (now - began) * (1 - fraction) / (fraction - first)
 
     def _write(self, text: str) -> None:
         self._stream.write(text)

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import bpy
+import numpy as np
 
 from ..bridge import requirements
 from ..bridge import scene as bridge_scene
@@ -36,6 +37,33 @@ class PAV_OT_add_head(bpy.types.Operator):
         rig = bridge_scene.build_head(Path(self.filepath))
         select(context, rig.mesh)
         bridge_scene.use_engine(context.scene)
+        return {"FINISHED"}
+
+
+class PAV_OT_add_rig(bpy.types.Operator):
+    """Add a head with its rig and no avatar: the built-in one, or that of a file"""
+
+    bl_idname = "pav.add_rig"
+    bl_label = "Add Head Rig"
+    bl_options: ClassVar = {"REGISTER", "UNDO"}
+
+    filepath: bpy.props.StringProperty(  # type: ignore[valid-type]
+        name="Head File",
+        description="A head file (.npz), or FLAME's; empty for the built-in head",
+        subtype="FILE_PATH",
+    )
+
+    @reporting
+    def execute(self, context: Any) -> set[str]:
+        from ..bridge.rig import build_rig
+        from ..core.head import BUILTIN, remember_head
+
+        head = remember_head(bpy.path.abspath(self.filepath) if self.filepath else BUILTIN)
+        object_mode(context)
+        betas = np.zeros(len(head.shape_basis), np.float32)
+        name = Path(self.filepath).stem if self.filepath else "Head"
+        rig = build_rig(head, betas, name, context.scene.collection)
+        select(context, rig.mesh)
         return {"FINISHED"}
 
 
@@ -71,5 +99,5 @@ class PAV_OT_save_head(bpy.types.Operator):
         return {"FINISHED"}
 
 
-classes = (PAV_OT_add_head, PAV_OT_save_head)
+classes = (PAV_OT_add_head, PAV_OT_add_rig, PAV_OT_save_head)
 register, unregister = bpy.utils.register_classes_factory(classes)

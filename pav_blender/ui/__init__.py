@@ -1,8 +1,8 @@
 """Panels: each draws, none computes."""
 
-from . import avatar, files, motion, output, training
+from . import avatar, files, motion, output, preferences, training
 
-modules = (avatar, files, motion, training, output)
+modules = (preferences, avatar, files, motion, training, output)
 
 
 def register() -> None:

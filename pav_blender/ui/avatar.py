@@ -22,6 +22,7 @@ class PAV_PT_avatar(Sidebar, bpy.types.Panel):
         row = layout.row(align=True)
         row.operator("pav.add_head", icon="IMPORT")
         row.operator("pav.save_head", icon="EXPORT")
+        layout.operator("pav.add_rig", icon="ARMATURE_DATA")
         active = context.active_object
         if head is None and active is not None and active.type == "MESH":
             head = active

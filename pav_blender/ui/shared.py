@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ..bridge import jobs, requirements
+from ..bridge import jobs, packages, requirements
 
 
 class Sidebar:
@@ -21,8 +21,8 @@ def draw_missing(layout: Any) -> None:
         return
     box = layout.box()
     box.label(text=f"Missing: {', '.join(names)}", icon="ERROR")
-    box.label(text="Install them in Blender's Python,")
-    box.label(text="or start Blender with PYTHONPATH set")
+    show = box.operator("preferences.addon_show", text="Install in Preferences", icon="PREFERENCES")
+    show.module = packages.ROOT
 
 
 def draw_job(layout: Any, name: str) -> None:

@@ -109,7 +109,7 @@ def _avatar(
     args: argparse.Namespace, collection: Any, steps: Steps, bar: Callable[[str], Progress]
 ) -> Any:
     from ..core.field.avatar import Avatar, read_header
-    from ..core.training.checkpoint import checkpoint_path
+    from ..core.training.places import checkpoint_path
     from ..core.training.train import fingerprint, train
 
     path = args.out / "avatar.pav"

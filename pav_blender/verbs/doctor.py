@@ -34,6 +34,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--compile", action="store_true", help="compile the kernels now instead of on first use"
     )
+    parser.add_argument(
+        "--json",
+        action="store_true",
+        help="all of it, and torch's devices, as one line; ends with code 0 whatever is missing",
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -41,6 +46,10 @@ def run(args: argparse.Namespace) -> int:
         print(f"kernels are compiled: {_compile():.0f} s")
         return 0
     missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
+    if args.json:
+        found = {"machine": machine(), "versions": versions(), "devices": devices()}
+        print(json.dumps({"environment": found | {"missing": missing}}), flush=True)
+        return 0
     print(json.dumps({"machine": machine(), "versions": versions()}, indent=1))
     for name, use in OPTIONAL.items():
         if importlib.util.find_spec(name) is None:
@@ -59,6 +68,20 @@ def versions() -> dict[str, str]:
         except importlib.metadata.PackageNotFoundError:
             if importlib.util.find_spec(name) is not None:
                 found[name] = "present"
+    return found
+
+
+def devices() -> list[str]:
+    """What torch can compute on, by name; empty where torch is missing or does not load."""
+    try:
+        import torch
+    except (ImportError, OSError):
+        return []
+    found = ["cpu"]
+    for index in range(torch.cuda.device_count()):
+        found.append(f"cuda:{index} {torch.cuda.get_device_name(index)}")
+    if torch.backends.mps.is_available():
+        found.append("mps")
     return found
 
 

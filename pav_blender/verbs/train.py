@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import signal
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 from ..core.progress import Progress
+from ..core.stopping import StopSignal
 
 SUMMARY = "Train an avatar on the training frames of a collection."
 EXAMPLE = "pav train out/collection --out out/avatar.pav --minutes 5"
@@ -35,22 +34,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="write the collection with its track corrected (needs --refine-poses)",
     )
+    parser.add_argument(
+        "--preview",
+        type=Path,
+        metavar="DIR",
+        help="show how it is going: preview.png (filmed above, avatar below) and curve.json there",
+    )
     parser.add_argument("--resume", action="store_true", help="go on from the last checkpoint")
-
-
-class StopSignal:
-    """True after Ctrl-C or a polite kill, so that work ends where it can be taken up again."""
-
-    def __init__(self) -> None:
-        self._stopped = False
-        for kind in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(kind, self._stop)
-
-    def _stop(self, number: int, frame: FrameType | None) -> None:
-        self._stopped = True
-
-    def __call__(self) -> bool:
-        return self._stopped
 
 
 def run(args: argparse.Namespace) -> int:
@@ -69,6 +59,7 @@ def run(args: argparse.Namespace) -> int:
         minutes=args.minutes,
         resume=args.resume,
         refined=args.refined_collection,
+        preview=args.preview,
         device=device_of(args.device),
         progress=Progress("train", as_json=args.json_progress),
         loading=Progress("read", as_json=args.json_progress),

@@ -17,12 +17,14 @@ import hashlib
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 
 from ..errors import InputError
-from .skinning import pose_vertices
+
+if TYPE_CHECKING:
+    import torch
 
 CANONICAL_JAW_DEGREES = 12.0  # INSTA's canonical space: the lips do not touch
 _BASES = ("shape_basis", "expression_basis", "pose_basis")
@@ -84,6 +86,10 @@ class HeadModel:
         Returns [F,V,3] on the device of ``pose``; float64 where any argument is a float64 tensor,
         else float32. Raises :class:`InputError` for shapes that do not fit.
         """
+        import torch  # here, so that a head can be read and rigged where there is no torch
+
+        from .skinning import pose_vertices
+
         arguments = (betas, expression, pose, translation)
         double = any(torch.is_tensor(a) and a.dtype == torch.float64 for a in arguments)
         dtype = torch.float64 if double else torch.float32
@@ -129,9 +135,8 @@ class HeadModel:
         """
         betas = _vector(betas, len(self.shape_basis), "identity")
         expression = np.zeros((1, len(self.expression_names)), np.float32)
-        with torch.no_grad():
-            still = np.zeros((1, 3), np.float32)
-            return self.pose(betas, expression, self.canonical_pose(), still)[0].numpy()
+        still = np.zeros((1, 3), np.float32)
+        return self.pose(betas, expression, self.canonical_pose(), still)[0].numpy()
 
     def canonical_pose(self) -> np.ndarray:
         """The jaw, if there is one, open by 12 degrees: [1,J,3] float32."""
@@ -143,11 +148,13 @@ class HeadModel:
     def landmarks(self, vertices):
         """Landmark positions [...,L,3] on vertices [...,V,3] (array or tensor, differentiable)."""
         corners = self.triangles[self.landmark_triangles]
-        if torch.is_tensor(vertices):
-            index = torch.tensor(corners, dtype=torch.long, device=vertices.device)
-            weights = torch.tensor(self.landmark_barycentrics).to(vertices)
-            return (vertices[..., index, :] * weights[..., None]).sum(-2)
-        return (vertices[..., corners, :] * self.landmark_barycentrics[..., None]).sum(-2)
+        if isinstance(vertices, np.ndarray):
+            return (vertices[..., corners, :] * self.landmark_barycentrics[..., None]).sum(-2)
+        import torch
+
+        index = torch.tensor(corners, dtype=torch.long, device=vertices.device)
+        weights = torch.tensor(self.landmark_barycentrics).to(vertices)
+        return (vertices[..., index, :] * weights[..., None]).sum(-2)
 
     @cached_property
     def fingerprint(self) -> str:
@@ -164,6 +171,8 @@ class HeadModel:
         return {}
 
     def tensors(self, device: torch.device, dtype: torch.dtype) -> dict[str, torch.Tensor]:
+        import torch
+
         key = (str(device), dtype)
         if key not in self._tensor_cache:
             tensors = {
@@ -216,6 +225,8 @@ def _freeze(head: HeadModel, field: str, dtype: type) -> None:
 
 
 def _tensor(values, device: torch.device, dtype: torch.dtype) -> torch.Tensor:
+    import torch
+
     if torch.is_tensor(values):
         return values.to(device, dtype)
     return torch.tensor(np.asarray(values), dtype=dtype, device=device)

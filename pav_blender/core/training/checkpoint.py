@@ -17,11 +17,6 @@ from .trainer import Status, Trainer
 FORMAT = "pav-checkpoint"
 
 
-def checkpoint_path(avatar_path: Path) -> Path:
-    """Where the checkpoint of an avatar being trained lies: beside it."""
-    return avatar_path.with_suffix(".checkpoint")
-
-
 def save_checkpoint(path: Path, trainer: Trainer, source: str) -> None:
     """Writes the whole state of `trainer`; `source` says which data it was learning from."""
     tensors: dict[str, torch.Tensor] = {

@@ -15,8 +15,10 @@ from ..errors import Cancelled, InputError
 from ..field.avatar import Avatar
 from ..kernels.cpu.threads import torch_alone
 from ..progress import Report
-from .checkpoint import checkpoint_path, load_checkpoint, save_checkpoint
+from .checkpoint import load_checkpoint, save_checkpoint
+from .places import checkpoint_path
 from .prepare import load_training_frames, new_avatar
+from .preview import Preview
 from .refined import correct_collection, refined_writer, write_refined
 from .refiner import Refiner, kept_out
 from .trainer import Trainer
@@ -32,6 +34,7 @@ def train(
     minutes: float | None = None,
     resume: bool = False,
     refined: Path | str | None = None,
+    preview: Path | str | None = None,
     progress: Report | None = None,
     loading: Report | None = None,
     refining: Report | None = None,
@@ -42,8 +45,9 @@ def train(
 
     minutes: plan for this much time in the loop instead of `config.iterations`. A checkpoint is
     kept beside `out` while the work goes on; `resume=True` continues from it. refined: where
-    `config.refine_poses` is on, the folder for the collection with its track corrected. Raises
-    Cancelled (the checkpoint stays) when `should_stop()`, InputError for bad input.
+    `config.refine_poses` is on, the folder for the collection with its track corrected. preview:
+    a folder for pictures of how it is going (`.preview`). Raises Cancelled (the checkpoint stays)
+    when `should_stop()`, InputError for bad input.
     """
     if not isinstance(collection, Collection):
         collection = read_collection(collection)
@@ -71,6 +75,7 @@ def train(
         refiner = trainer.refiner = Refiner(collection, frames, held, trainer)
     if resume:
         load_checkpoint(saved, trainer, source)
+    shown = None if preview is None else Preview(preview, collection, trainer)
     last_saved = time.monotonic()
     while trainer.done < 1:
         with torch_alone():
@@ -83,6 +88,8 @@ def train(
                 psnr=round(status.psnr, 2),
                 samples_per_ray=round(status.samples_per_ray, 1),
             )
+        if shown is not None:
+            shown(status, last=trainer.done >= 1)
         stopping = should_stop is not None and should_stop()
         if stopping or time.monotonic() - last_saved > _CHECKPOINT_SECONDS:
             save_checkpoint(saved, trainer, source)
@@ -100,6 +107,7 @@ def train(
         "iterations": trainer.status.iteration,
         "seconds": round(trainer.status.seconds, 1),
         "batch_psnr": round(trainer.status.psnr, 2),
+        **({} if shown is None else {"preview_seconds": round(shown.seconds, 1)}),
         "collection": source,
     }
     avatar.save(out)

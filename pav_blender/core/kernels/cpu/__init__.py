@@ -22,6 +22,8 @@ _KEPT_CACHES = 4
 
 
 def _cache_root() -> Path:
+    if os.environ.get("PAV_CACHE"):  # as a Blender extension: the folder it may write to
+        return Path(os.environ["PAV_CACHE"])
     if os.environ.get("XDG_CACHE_HOME"):
         return Path(os.environ["XDG_CACHE_HOME"])
     if sys.platform == "win32" and os.environ.get("LOCALAPPDATA"):
