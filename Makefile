@@ -6,30 +6,34 @@ VENV ?= .venv
 RUN = $(VENV)/bin/python
 OUT ?= out
 
-.PHONY: demo test test-52 test-all lint extension test-real-blender clean
+.PHONY: demo test test-52 test-all lint extension extension-plain test-real-blender clean
 
 demo: $(VENV)/ready
 	$(RUN) -m pav_blender doctor --compile
 	$(RUN) -m pav_blender demo --out $(OUT)/demo --check
 
-test: $(VENV)/ready lint extension
+test: $(VENV)/ready lint extension-plain
 	$(RUN) -m pytest tests --durations=10
 
 test-52:
 	$(MAKE) PYTHON=$(PYTHON52) VENV=.venv52 test
 
-test-all: $(VENV)/ready lint extension
+test-all: $(VENV)/ready lint extension-plain
 	PAV_SLOW=1 $(RUN) -m pytest tests --durations=20
 
 lint: $(VENV)/ready
 	$(VENV)/bin/ruff check pav_blender tests tools
 	$(VENV)/bin/mypy
 
+# a zip without packages, and one a platform with wheels, which come from a package index
 extension: $(VENV)/ready
+	$(RUN) tools/build_extension.py --out $(OUT) --wheels
+
+extension-plain: $(VENV)/ready
 	$(RUN) tools/build_extension.py --out $(OUT)
 
 # BLENDER: an executable or a wrapper, e.g. BLENDER=/opt/blender/blender
-test-real-blender: $(VENV)/ready extension
+test-real-blender: $(VENV)/ready extension-plain
 	BLENDER="$(BLENDER)" $(RUN) -m pytest tests/real_blender
 
 $(VENV)/ready: requirements/py311.txt requirements/py313.txt pyproject.toml

@@ -41,7 +41,7 @@ BUILDS = {"CPU": CPU, "CUDA": CUDA}
 # with these versions the project is tested (requirements/wheels.txt); without what they need in
 # turn: that is numpy, which Blender has
 OTHERS = {
-    "numba": ("numba==0.68.1", "llvmlite==0.48.0"),
+    "numba": ("numba==0.68.1", "llvmlite==0.50.0"),
     "safetensors": ("safetensors==0.8.0",),
     "scipy": ("scipy==1.17.1",),
 }

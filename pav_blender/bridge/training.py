@@ -146,6 +146,8 @@ class Watch:
             return
         row = (said.get("iteration"), said.get("seconds"), said.get("loss"), said.get("psnr"))
         if all(isinstance(value, int | float) for value in row):
+            while self.curve and self.curve[-1][0] >= float(said["iteration"]):
+                self.curve.pop()  # what a crash lost is learned again
             self.curve.append(tuple(float(value) for value in row if value is not None))
         if len(self.curve) > 2000:
             del self.curve[::2]

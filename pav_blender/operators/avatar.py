@@ -89,7 +89,6 @@ class PAV_OT_save_head(bpy.types.Operator):
 
     @reporting
     def execute(self, context: Any) -> set[str]:
-        requirements.check()
         from ..bridge.heads import head_from_object
         from ..core.head import write_head
 

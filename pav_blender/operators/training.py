@@ -16,7 +16,7 @@ def _start(wanted: training.Wanted, resume: bool) -> set[str]:
     jobs.start(
         jobs.TRAINING,
         lambda: training.start(wanted, resume=resume),
-        f"Wrote {wanted.output}",
+        f"Wrote {wanted.output.name}",
     )
     return {"FINISHED"}
 
@@ -105,6 +105,7 @@ class PAV_OT_add_clips(bpy.types.Operator):
         for name in [file.name for file in self.files if file.name]:
             path = str(Path(self.directory) / name)
             if path not in known:
+                known.add(path)
                 clip = settings.clips.add()
                 clip.path, clip.appearance = path, Path(name).stem
         settings.active_clip = max(0, len(settings.clips) - 1)

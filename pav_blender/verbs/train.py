@@ -40,6 +40,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="show how it is going: preview.png (filmed above, avatar below) and curve.json there",
     )
+    parser.add_argument(
+        "--checkpoint-every",
+        type=float,
+        default=30.0,
+        metavar="SECONDS",
+        help="what an interrupted training loses at most (30)",
+    )
     parser.add_argument("--resume", action="store_true", help="go on from the last checkpoint")
 
 
@@ -60,6 +67,7 @@ def run(args: argparse.Namespace) -> int:
         resume=args.resume,
         refined=args.refined_collection,
         preview=args.preview,
+        checkpoint_every=args.checkpoint_every,
         device=device_of(args.device),
         progress=Progress("train", as_json=args.json_progress),
         loading=Progress("read", as_json=args.json_progress),

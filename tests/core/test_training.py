@@ -17,9 +17,9 @@ from pav_blender.core.field.avatar import Avatar
 from pav_blender.core.rendering.render import RenderSettings, pose_scene
 from pav_blender.core.training.attention import Attention
 from pav_blender.core.training.batches import draw_pixels, pick_samples
-from pav_blender.core.training.places import checkpoint_path
 from pav_blender.core.training.frames import halved
 from pav_blender.core.training.losses import distortion, losses
+from pav_blender.core.training.places import checkpoint_path
 from pav_blender.core.training.prepare import load_training_frames, new_avatar
 from pav_blender.core.training.train import train
 from pav_blender.core.training.trainer import Trainer

@@ -23,7 +23,7 @@ from .refined import correct_collection, refined_writer, write_refined
 from .refiner import Refiner, kept_out
 from .trainer import Trainer
 
-_CHECKPOINT_SECONDS = 30.0
+CHECKPOINT_SECONDS = 30.0
 
 
 def train(
@@ -35,6 +35,7 @@ def train(
     resume: bool = False,
     refined: Path | str | None = None,
     preview: Path | str | None = None,
+    checkpoint_every: float = CHECKPOINT_SECONDS,
     progress: Report | None = None,
     loading: Report | None = None,
     refining: Report | None = None,
@@ -44,7 +45,8 @@ def train(
     """Trains an avatar on the "train" frames of a collection and writes it to `out`.
 
     minutes: plan for this much time in the loop instead of `config.iterations`. A checkpoint is
-    kept beside `out` while the work goes on; `resume=True` continues from it. refined: where
+    kept beside `out` while the work goes on, written anew every `checkpoint_every` seconds;
+    `resume=True` continues from it. refined: where
     `config.refine_poses` is on, the folder for the collection with its track corrected. preview:
     a folder for pictures of how it is going (`.preview`). Raises Cancelled (the checkpoint stays)
     when `should_stop()`, InputError for bad input.
@@ -91,7 +93,7 @@ def train(
         if shown is not None:
             shown(status, last=trainer.done >= 1)
         stopping = should_stop is not None and should_stop()
-        if stopping or time.monotonic() - last_saved > _CHECKPOINT_SECONDS:
+        if stopping or time.monotonic() - last_saved >= checkpoint_every:
             save_checkpoint(saved, trainer, source)
             last_saved = time.monotonic()
         if stopping:
