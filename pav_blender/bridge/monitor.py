@@ -14,8 +14,7 @@ from ..core.errors import PavError
 from ..core.training.places import PICTURE
 from .training import Watch
 
-TILE = 128  # pixels of a part of the curve: icons are square, so it is shown in parts
-PARTS = 3
+SIDE = 192  # pixels of the curve's picture: icons are square
 _FINER = 3
 _BACK, _GRID = (0.11, 0.11, 0.12), (0.2, 0.2, 0.22)
 PSNR_COLOUR, LOSS_COLOUR = (0.35, 0.65, 1.0), (0.95, 0.6, 0.25)
@@ -24,9 +23,11 @@ _REFRESH_S = 1.0
 
 @dataclass
 class Icons:
-    """curve: icon numbers from left to right; pictures: (filmed, avatar) an appearance."""
+    """curve: an icon number, 0 for none; pictures: (filmed, avatar) an appearance."""
 
-    curve: list[int] = field(default_factory=list)
+    curve: int = 0
+    blue: int = 0  # the colours of the PSNR's line and the loss's
+    orange: int = 0
     pictures: list[tuple[int, int]] = field(default_factory=list)
 
 
@@ -74,8 +75,8 @@ def icons(watch: Watch) -> Icons:
     key = (str(watch.wanted.output), len(watch.curve), watch.curve[-1:])
     if curve.key != key and time.monotonic() - _drawn_at > _REFRESH_S:
         _drawn_at = time.monotonic()
-        picture = curve_picture(watch.curve)
-        curve.replace(key, [picture[:, i * TILE : (i + 1) * TILE] for i in range(PARTS)])
+        swatches = [_swatch(colour) for colour in (PSNR_COLOUR, LOSS_COLOUR)]
+        curve.replace(key, [curve_picture(watch.curve), *swatches])
     path = watch.wanted.preview / PICTURE
     try:
         stamp: Any = (str(path), path.stat().st_mtime_ns)
@@ -87,7 +88,8 @@ def icons(watch: Watch) -> Icons:
         pictures.replace(stamp, pieces(path))
     shown = pictures.icons
     half = len(shown) // 2
-    return Icons(curve.icons, list(zip(shown[:half], shown[half:], strict=True)))
+    graph, blue, orange = curve.icons or (0, 0, 0)
+    return Icons(graph, blue, orange, list(zip(shown[:half], shown[half:], strict=True)))
 
 
 def forget() -> None:
@@ -114,9 +116,9 @@ def pieces(path: Path) -> list[np.ndarray]:
 
 
 def curve_picture(rows: list[tuple[float, ...]]) -> np.ndarray:
-    """PSNR and loss (logarithmic) over iterations, [TILE, PARTS * TILE, 4] in [0, 1]; empty axes
+    """PSNR and loss (logarithmic) over iterations, [SIDE, SIDE, 4] in [0, 1]; empty axes
     where there are no two rows."""
-    height, width = TILE * _FINER, PARTS * TILE * _FINER
+    height = width = SIDE * _FINER
     canvas = np.empty((height, width, 3), np.float32)
     canvas[:] = _BACK
     for part in (0.25, 0.5, 0.75):
@@ -129,8 +131,15 @@ def curve_picture(rows: list[tuple[float, ...]]) -> np.ndarray:
             (table[:, 3], PSNR_COLOUR),
         ):
             _draw_line(canvas, x, values, colour)
-    small = canvas.reshape(TILE, _FINER, PARTS * TILE, _FINER, 3).mean((1, 3))
+    small = canvas.reshape(SIDE, _FINER, SIDE, _FINER, 3).mean((1, 3))
     return np.concatenate([small, np.ones((*small.shape[:2], 1), np.float32)], 2)
+
+
+def _swatch(colour: tuple[float, float, float]) -> np.ndarray:
+    """A short thick line, [32, 32, 4]."""
+    picture = np.zeros((32, 32, 4), np.float32)
+    picture[13:19, 4:28] = (*colour, 1)
+    return picture
 
 
 def _draw_line(

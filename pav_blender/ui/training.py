@@ -43,8 +43,8 @@ class PAV_PT_train(Sidebar, bpy.types.Panel):
     def draw(self, context: Any) -> None:
         layout, settings = self.layout, context.scene.pav.training
         job = jobs.current()
-        ours = job is not None and job.name == jobs.TRAINING
-        if ours and job.running:
+        job = job if job is not None and job.name == jobs.TRAINING else None
+        if job is not None and job.running:
             _draw_running(context, layout, job)
             return
         draw_missing(layout)
@@ -53,7 +53,7 @@ class PAV_PT_train(Sidebar, bpy.types.Panel):
             _draw_unfinished(layout, settings)
         else:
             _draw_setup(layout, settings)
-        if ours:
+        if job is not None:
             _draw_ended(context, layout, job)
 
 
@@ -140,12 +140,14 @@ def _draw_watch(context: Any, layout: Any, watch: training.Watch) -> None:
     room = context.region.width / (_UNIT * context.preferences.system.ui_scale)
     if len(watch.curve) > 1:
         first, last = watch.curve[0], watch.curve[-1]
-        row = layout.row()
-        row.label(text=f"PSNR {first[3]:.1f} to {last[3]:.1f} dB")
-        row.label(text=f"loss {first[2]:.2g} to {last[2]:.2g}")
-        row = layout.row(align=True)
-        for icon in icons.curve:
-            row.template_icon(icon_value=icon, scale=(room - 2.5) / monitor.PARTS)
+        split = layout.split(factor=0.6)
+        split.template_icon(icon_value=icons.curve, scale=0.6 * (room - 3))
+        column = split.column(align=True)
+        column.label(text=f"{last[3]:.1f} dB", icon_value=icons.blue)
+        column.label(text=f"from {first[3]:.1f}", icon="BLANK1")
+        column.label(text=f"loss {last[2]:.2g}", icon_value=icons.orange)
+        column.label(text=f"from {first[2]:.2g}", icon="BLANK1")
+        column.label(text=f"{last[0]:,.0f} steps", icon="BLANK1")
     if icons.pictures:
         layout.label(text="Filmed above, avatar below:")
         scale = min(8.0, (room - 2.5) / len(icons.pictures))

@@ -168,7 +168,7 @@ head.data.shape_keys.key_blocks["jawOpen"].value = 1.0
 bpy.ops.pav.save_head(filepath="mine.npz")
 assert bpy.ops.pav.add_rig(filepath="mine.npz") == {"FINISHED"}
 assert bpy.context.object.name == "mine"
-for wrong, said in (("nowhere.npz", "no such head file"), (sys.argv[2], "not a readable head file")):
+for wrong, said in (("nowhere.npz", "no such head"), (sys.argv[2], "not a readable head")):
     try:
         bpy.ops.pav.add_rig(filepath=wrong)
     except RuntimeError as error:
@@ -181,7 +181,8 @@ scene.render.engine = "PAV"
 scene.pav.training.source, scene.pav.training.collection = "COLLECTION", "/tmp"
 scene.pav.training.output = "/tmp/never.pav"
 head.pav.avatar = "/tmp/some.pav"
-for operator in (bpy.ops.render.render, bpy.ops.pav.train):
+assert head.pav.appearance == ""
+for operator in (bpy.ops.render.render, bpy.ops.pav.train, bpy.ops.pav.add_head):
     try:
         operator()
     except RuntimeError as error:

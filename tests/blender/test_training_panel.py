@@ -212,7 +212,7 @@ def test_trains_to_the_end_without_a_window(asked, tmp_path):
     layout = panel()
     assert "Wrote me.pav" in layout.texts
     assert "pav.add_head" in layout.texts
-    assert layout.icons == monitor.PARTS + 4
+    assert layout.icons == 1 + 4
     monitor.forget()
 
 
@@ -335,8 +335,8 @@ def test_phases_share_the_bar_by_their_weight():
 def test_the_curve_rises_where_the_psnr_does():
     rows = [(i, i, 2.0 / (1 + i), 10.0 + i) for i in range(50)]
     picture = monitor.curve_picture(rows)
-    assert picture.shape == (monitor.TILE, monitor.TILE * monitor.PARTS, 4)
+    assert picture.shape == (monitor.SIDE, monitor.SIDE, 4)
     blue = (picture[..., 2] > 0.6) & (picture[..., 0] < 0.5)
     left, right = blue[:, 5].nonzero()[0].mean(), blue[:, -5].nonzero()[0].mean()
-    assert left > 100 > 30 > right
+    assert left > 150 > 40 > right
     assert monitor.curve_picture([]).std() < 0.5

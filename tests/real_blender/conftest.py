@@ -29,6 +29,7 @@ class RealBlender:
     def __call__(self, *arguments: object, timeout: float = 600) -> subprocess.CompletedProcess:
         # settings of its own: the user's Blender stays as it is
         environment = {**os.environ, "BLENDER_USER_RESOURCES": str(WORK / "resources")}
+        environment["PAV_CACHE"] = str(WORK.with_name("real-blender-cache"))  # compile once
         command = [*self.command, *map(str, arguments)]
         child = subprocess.Popen(
             command,

@@ -25,6 +25,7 @@ from .trainer import Status, Trainer
 
 SIDE = 160  # pixels of a picture
 MOST_COLUMNS = 4
+_NOTE_S = 2.0  # between two points of the curve
 _EVERY_S = 20.0  # at least so long between two pictures,
 _COST = 0.01  # and so long that they take no more than this part of the training
 _GREY = 0.5  # what lies behind the person
@@ -46,17 +47,17 @@ class Preview:
         self._points = [
             point for point in read_curve(self.folder) if point[0] <= trainer.status.iteration
         ]
-        self._due = 0.0
+        self._due = self._noted = 0.0
         self.seconds = 0.0  # that it took, all together
 
     def __call__(self, status: Status, *, last: bool = False) -> bool:
         """Notes where training stands; True where that was the moment for a new picture."""
-        if not last and time.monotonic() < self._due:
-            return False
         started = time.monotonic()
-        point = (status.iteration, round(status.seconds, 2), status.loss, status.psnr)
-        if all(math.isfinite(value) for value in point):
-            self._points = [*self._points, point][-_MOST_POINTS:]
+        if last or started - self._noted > _NOTE_S:
+            self._note(status)
+            self._noted = started
+        if not last and started < self._due:
+            return False
         write_text(self.folder / CURVE, json.dumps({"columns": COLUMNS, "rows": self._points}))
         pictures = [self._draw(frame) for frame in self._frames]
         rows = [np.concatenate(row, 1) for row in (self._truth, pictures)]
@@ -65,6 +66,13 @@ class Preview:
         self.seconds += took
         self._due = time.monotonic() + max(_EVERY_S, took / _COST)
         return True
+
+    def _note(self, status: Status) -> None:
+        point = (status.iteration, round(status.seconds, 2), status.loss, status.psnr)
+        if all(math.isfinite(value) for value in point):
+            self._points.append(point)
+        if len(self._points) > _MOST_POINTS:
+            del self._points[1:-1:2]
 
     def _draw(self, frame: Frame) -> np.ndarray:
         camera = frame.camera.resized(SIDE, SIDE)
