@@ -19,6 +19,7 @@ _FINER = 3
 _BACK, _GRID = (0.11, 0.11, 0.12), (0.2, 0.2, 0.22)
 PSNR_COLOUR, LOSS_COLOUR = (0.35, 0.65, 1.0), (0.95, 0.6, 0.25)
 _REFRESH_S = 1.0
+_SMALL = 32
 
 
 @dataclass
@@ -51,6 +52,9 @@ class _Shelf:
             preview.image_size = picture.shape[1], picture.shape[0]
             flipped = np.ascontiguousarray(picture[::-1], np.float32)
             preview.image_pixels_float.foreach_set(flipped.ravel())
+            if max(picture.shape) <= _SMALL:  # beside text Blender shows the other of the two
+                preview.icon_size = picture.shape[1], picture.shape[0]
+                preview.icon_pixels_float.foreach_set(flipped.ravel())
             self.icons.append(preview.icon_id)
         for name in old:
             del self._previews[name]
@@ -136,8 +140,8 @@ def curve_picture(rows: list[tuple[float, ...]]) -> np.ndarray:
 
 
 def _swatch(colour: tuple[float, float, float]) -> np.ndarray:
-    """A short thick line, [32, 32, 4]."""
-    picture = np.zeros((32, 32, 4), np.float32)
+    """A short thick line, [_SMALL, _SMALL, 4]."""
+    picture = np.zeros((_SMALL, _SMALL, 4), np.float32)
     picture[13:19, 4:28] = (*colour, 1)
     return picture
 

@@ -92,16 +92,6 @@ def read_gray(path: Path | str) -> np.ndarray:
     return np.ascontiguousarray(pixels if pixels.ndim == 2 else pixels[..., 0])
 
 
-def resized(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
-    """float32 [H, W, C] -> [height, width, C], filtered."""
-    oiio = _oiio()
-    shape = pixels.shape
-    source = oiio.ImageBuf(oiio.ImageSpec(shape[1], shape[0], shape[2], oiio.FLOAT))
-    source.set_pixels(oiio.ROI(), np.ascontiguousarray(pixels, np.float32))
-    roi = oiio.ROI(0, width, 0, height, 0, 1, 0, shape[2])
-    return np.asarray(oiio.ImageBufAlgo.resize(source, roi=roi).get_pixels(oiio.FLOAT))
-
-
 def write_rgba(
     path: Path | str,
     pixels: np.ndarray,

@@ -84,6 +84,9 @@ def run(args: argparse.Namespace) -> int:
         f"{record['iterations']} iterations in {record['seconds']:.0f} s, "
         f"{record['batch_psnr']:.1f} dB on training rays"
     )
+    if "preview_seconds" in record:
+        share = record["preview_seconds"] / max(record["seconds"], 1e-9)
+        print(f"  pictures of how it was going: {record['preview_seconds']:.1f} s, {share:.1%}")
     return 0
 
 

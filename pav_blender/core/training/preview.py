@@ -16,9 +16,10 @@ import numpy as np
 from ..collection import Collection
 from ..errors import InputError
 from ..files import write_text
-from ..images import resized, write_rgba
+from ..images import write_rgba
 from ..rendering.rays import camera_rays
 from ..rendering.render import RenderSettings, trace_rays
+from ..tracking.crop import resize
 from .frames import Frame, load_frames
 from .places import COLUMNS, CURVE, PICTURE, read_curve
 from .trainer import Status, Trainer
@@ -47,7 +48,7 @@ class Preview:
         self._points = [
             point for point in read_curve(self.folder) if point[0] <= trainer.status.iteration
         ]
-        self._due = self._noted = 0.0
+        self._due, self._noted, self._first = 0.0, 0.0, True
         self.seconds = 0.0  # that it took, all together
 
     def __call__(self, status: Status, *, last: bool = False) -> bool:
@@ -64,7 +65,9 @@ class Preview:
         write_rgba(self.folder / PICTURE, np.concatenate(rows))
         took = time.monotonic() - started
         self.seconds += took
-        self._due = time.monotonic() + max(_EVERY_S, took / _COST)
+        # the first may wait for the compiler: what others cost is not known by it
+        cost = 0.0 if self._first else took
+        self._due, self._first = time.monotonic() + max(_EVERY_S, cost / _COST), False
         return True
 
     def _note(self, status: Status) -> None:
@@ -112,6 +115,5 @@ def _on_grey(rgba: np.ndarray) -> np.ndarray:
     """Straight [H, W, 4] in [0, 1] laid over grey, opaque, SIDE pixels a side."""
     alpha = rgba[..., 3:]
     laid = rgba[..., :3] * alpha + _GREY * (1 - alpha)
-    if laid.shape[:2] != (SIDE, SIDE):
-        laid = resized(laid, SIDE, SIDE)
+    laid = resize(np.ascontiguousarray(laid, np.float32), SIDE).clip(0, 1)
     return np.concatenate([laid, np.ones((SIDE, SIDE, 1), np.float32)], 2)
