@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from ..errors import InputError
 
@@ -37,6 +36,8 @@ Regions = Mapping[str, np.ndarray]
 
 def _beside(vertices: np.ndarray, members: np.ndarray, reach: float) -> np.ndarray:
     """1 up to `reach` metres from a region, 0 an edge farther."""
+    from scipy.spatial import cKDTree  # here, for the add-on loads where there is none
+
     distance, _ = cKDTree(vertices[members]).query(vertices)
     return np.clip((reach + _EDGE - distance) / _EDGE, 0, 1)
 
