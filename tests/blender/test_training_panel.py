@@ -216,6 +216,27 @@ def test_trains_to_the_end_without_a_window(asked, tmp_path):
     monitor.forget()
 
 
+@pytest.mark.slow
+def test_two_videos_become_an_avatar_of_two_appearances(settings, tmp_path, request, monkeypatch):
+    monkeypatch.syspath_prepend(str(request.config.rootpath / "tests" / "core"))
+    import filmed
+
+    for name, look in (("one", "crop"), ("two", "grey")):
+        filmed.film(tmp_path / f"{name}.mp4", [filmed.frame(look, row) for row in range(12)])
+    bpy.ops.pav.add_clips(directory=str(tmp_path), files=[{"name": "one.mp4"}, {"name": "two.mp4"}])
+    settings.clips[1].appearance = "silver"
+    settings.output, settings.minutes = str(tmp_path / "me.pav"), 0
+    settings.options = "--iterations 4"
+    assert bpy.ops.pav.train() == {"FINISHED"}
+    assert [phase.label for phase in training.watched().pipeline.phases] == ["Track", "Train"]
+    from pav_blender.bridge import avatars
+
+    assert avatars.header(tmp_path / "me.pav")["appearances"] == ["one", "silver"]
+    assert (tmp_path / "me.collection" / "collection.json").is_file()
+    assert bpy.ops.pav.train() == {"FINISHED"}  # and the track is used again
+    assert [phase.label for phase in training.watched().pipeline.phases] == ["Train"]
+
+
 def until(condition, seconds=60.0):
     end = time.monotonic() + seconds
     while not condition():

@@ -109,7 +109,7 @@ def train(
         "iterations": trainer.status.iteration,
         "seconds": round(trainer.status.seconds, 1),
         "batch_psnr": round(trainer.status.psnr, 2),
-        **({} if shown is None else {"preview_seconds": round(shown.seconds, 1)}),
+        **({} if shown is None or resume else {"preview_seconds": round(shown.seconds, 1)}),
         "collection": source,
     }
     avatar.save(out)
