@@ -59,7 +59,7 @@ class Preview:
             self._noted = started
         if not last and started < self._due:
             return False
-        write_text(self.folder / CURVE, json.dumps({"columns": COLUMNS, "rows": self._points}))
+        self.keep_curve()
         pictures = [self._draw(frame) for frame in self._frames]
         rows = [np.concatenate(row, 1) for row in (self._truth, pictures)]
         write_rgba(self.folder / PICTURE, np.concatenate(rows))
@@ -69,6 +69,10 @@ class Preview:
         cost = 0.0 if self._first else took
         self._due, self._first = time.monotonic() + max(_EVERY_S, cost / _COST), False
         return True
+
+    def keep_curve(self) -> None:
+        """Writes the curve so far; with a checkpoint, so that both are there to go on from."""
+        write_text(self.folder / CURVE, json.dumps({"columns": COLUMNS, "rows": self._points}))
 
     def _note(self, status: Status) -> None:
         point = (status.iteration, round(status.seconds, 2), status.loss, status.psnr)

@@ -95,6 +95,8 @@ def train(
         stopping = should_stop is not None and should_stop()
         if stopping or time.monotonic() - last_saved >= checkpoint_every:
             save_checkpoint(saved, trainer, source)
+            if shown is not None:
+                shown.keep_curve()
             last_saved = time.monotonic()
         if stopping:
             raise Cancelled(f"training was stopped; `--resume` goes on from {saved}")
