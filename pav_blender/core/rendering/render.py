@@ -158,13 +158,32 @@ def render(
     (x0, y0, x1, y1), top-left origin. Raises InputError for input that does not fit and Cancelled
     when `should_stop()`.
     """
-    settings = settings or RenderSettings()
     if region is not None:
         camera = camera.window(*region)
-    caller, done, evaluations = threading.get_ident(), 0, 0
-    counting = threading.Lock()
     with torch.inference_mode(), torch_alone():
         scene = pose_scene(avatar, vertices, appearance, expression)
+    return render_scene(scene, camera, settings, progress=progress, should_stop=should_stop)
+
+
+def render_scene(
+    scene: Scene,
+    camera: Camera,
+    settings: RenderSettings | None = None,
+    *,
+    limit: np.ndarray | None = None,
+    progress: Callable[[float], None] | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> Picture:
+    """Renders an avatar that `pose_scene` posed, as often as one likes.
+
+    limit [H, W]: how far each pixel sees, metres along the camera's axis: what lies behind is
+    neither looked at nor shown. Raises Cancelled when `should_stop()`.
+    """
+    settings = settings or RenderSettings()
+    caller, done, evaluations = threading.get_ident(), 0, 0
+    counting = threading.Lock()
+    limits = None if limit is None else np.asarray(limit, np.float32).reshape(-1)
+    with torch.inference_mode(), torch_alone():
         order = tiled(camera.width, camera.height)
         count = len(order)
         rgba = np.zeros((count, 4), np.float32)
@@ -177,7 +196,8 @@ def render(
             if ours and should_stop is not None and should_stop():
                 raise Cancelled("rendering was cancelled")
             pixels = order[start:stop]
-            rays = camera_rays(camera, pixels % camera.width, pixels // camera.width)
+            far = None if limits is None else limits[pixels]
+            rays = camera_rays(camera, pixels % camera.width, pixels // camera.width, far)
             with torch.inference_mode():
                 rgba[pixels], depth[pixels], evaluated = _trace(scene, rays, settings)
             with counting:
@@ -233,6 +253,7 @@ def _whole(scene: Scene, rays: RayBatch, settings: RenderSettings) -> Traced:
     """The rays in one compiled pass."""
     ops, stance = kernels.select("cpu"), scene.stance
     near, far = ops.marching.bounds(scene.voxels.box, 0.0, rays.origins, rays.directions)
+    far = _ended(far, rays)
     half = torch.full((len(rays),), 0.5)
     first, last = ops.marching.lattice(near, far, half, settings.step)
     turned = rays.directions @ torch.from_numpy(stance.rotation)
@@ -275,7 +296,7 @@ def _by_waves(scene: Scene, rays: RayBatch, settings: RenderSettings) -> Traced:
     jitter = torch.full((count,), 0.5)
     around = (scene.voxels.box, 0.0) if settings.skip else (scene.mesh.vertices, reach)
     near, far = ops.marching.bounds(*around, rays.origins, rays.directions)
-    first, last = ops.marching.lattice(near, far, jitter, settings.step)
+    first, last = ops.marching.lattice(near, _ended(far, rays), jitter, settings.step)
     alive = (last >= first).nonzero()[:, 0]
     while len(alive):
         part = rays.pick(alive)
@@ -316,6 +337,10 @@ def _geometry(
     mixture = Mixture(wearing.mixture.shares.to(device), wearing.mixture.filled.to(device))
     sigma, parts, seen = geometry(field, mixture, wearing.worn, samples)
     return sigma, list(zip(seen, parts.T, strict=True))
+
+
+def _ended(far: torch.Tensor, rays: RayBatch) -> torch.Tensor:
+    return far if rays.end is None else torch.minimum(far, rays.end)
 
 
 def _wave(
