@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 
 from ..core.errors import InputError
 from ..core.rendering.cameras import Camera
+from ..core.rendering.solids import Solid
 from . import avatars, mesh
 from .axes import camera_to_core
 from .lens import frame_size, from_projection
@@ -49,6 +51,10 @@ class Actor:
         """A camera of the world as it stands to the head's own space."""
         pose = np.linalg.inv(self.rigid) @ camera.camera_to_world
         pose[:3, 3] /= self.scale
+        if camera.parallel:  # its intrinsics count pixels a metre
+            scale = np.diag([self.scale, self.scale, 1.0])
+            intrinsics = np.hstack([(scale @ camera.intrinsics)[:, :2], camera.intrinsics[:, 2:]])
+            return replace(camera, camera_to_world=pose, intrinsics=intrinsics)
         return replace(camera, camera_to_world=pose)
 
 
@@ -56,7 +62,8 @@ class Actor:
 class Shot:
     """One picture: the `region` (x0, y0, x1, y1) of what `camera` (world, core axes) sees,
     top-left origin; quality: a preset's name; background: scene-linear RGB, None for a transparent
-    film; chunk: rays between two looks at whether to stop, 0 for the renderer's own."""
+    film; chunk: rays between two looks at whether to stop, 0 for the renderer's own; solids: what
+    else is seen, with samples x samples of it a pixel, each a pixel of its own if `enlarged`."""
 
     actors: tuple[Actor, ...]
     camera: Camera
@@ -64,6 +71,9 @@ class Shot:
     quality: str
     background: tuple[float, float, float] | None
     chunk: int = 0
+    solids: tuple[Solid, ...] = ()
+    samples: int = 1
+    enlarged: bool = False
 
 
 def border(render: Any, width: int, height: int) -> tuple[int, int, int, int]:
@@ -125,13 +135,16 @@ def scene_camera(engine: Any, camera: Any, depsgraph: Any, width: int, height: i
     return Camera(width, height, intrinsics, camera_to_core(matrix))
 
 
-def find_actors(depsgraph: Any) -> tuple[Actor, ...]:
-    """Every visible object (or instance of one) that has an avatar file, ready to draw."""
+def find_actors(depsgraph: Any, shown: Callable[[Any], bool] | None = None) -> tuple[Actor, ...]:
+    """Every visible object (or instance of one) that has an avatar file, ready to draw. shown:
+    whether an original object is to be seen."""
     actors = []
     for instance in depsgraph.object_instances:
         evaluated = instance.object
         if evaluated.type == "MESH" and evaluated.pav.avatar and instance.show_self:
-            actors.append(read_actor(evaluated, instance.matrix_world, depsgraph))
+            owner = instance.parent if instance.is_instance else evaluated
+            if shown is None or shown(owner.original):
+                actors.append(read_actor(evaluated, instance.matrix_world, depsgraph))
     return tuple(actors)
 
 

@@ -8,7 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pav_blender.core.kernels import select
-from pav_blender.core.kernels.structures import Lights, Soup
+from pav_blender.core.kernels.soup import Lights, Soup
+from pav_blender.core.rendering.cameras import Camera
+from pav_blender.core.rendering.solids import Gatherer, Shape, Solid, compose, farthest, picture
 
 CPU, REFERENCE = select("cpu").solids, select("cpu", reference=True).solids
 LIGHTS = Lights(np.array([[-0.4, -0.5, -0.5], [0.2, 0.1, -0.1]]), 0.1)
@@ -162,3 +164,81 @@ def test_objects_have_their_own_places():
     colour, depth = check(soup, pinhole() @ places, np.tile(np.eye(3), (2, 1, 1)))
     assert set(np.unique(np.round(depth, 4))) == {2.0, 3.0, np.inf}
     assert colour[depth < 2.5][:, 1].max() < colour[np.isclose(depth, 3)][:, 1].min()
+
+
+def ball(place, colour, radius=0.2):
+    import trimesh
+
+    mesh = trimesh.creation.icosphere(subdivisions=3, radius=radius)
+    vertices, faces = np.float32(mesh.vertices), np.int32(mesh.faces)
+    shape = Shape(vertices, faces, vertices, faces, np.zeros(len(faces), np.int32))
+    pose = np.eye(4)
+    pose[:3, 3] = place
+    return Solid(shape, pose, np.float32([colour]))
+
+
+def view(width=40, height=30, orthographic=False):
+    focal = 40.0 if orthographic else 60.0
+    intrinsics = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    return Camera(width, height, intrinsics, np.eye(4), parallel=orthographic)
+
+
+@pytest.mark.parametrize("orthographic", [False, True])
+def test_solids_lie_where_the_camera_projects_them(orthographic):
+    things = [ball((0.1, -0.05, 1.5), (0.8, 0.2, 0.2)), ball((0.1, -0.05, 3), (0.1, 0.1, 0.9))]
+    camera = view(orthographic=orthographic)
+    colour, depth = picture(things, camera)
+    pixels, away = camera.project(np.array([[0.1, -0.05, 1.5]]))
+    x, y = np.floor(pixels[0]).astype(int)
+    assert abs(depth[y, x] - (away[0] - 0.2)) < 0.01
+    assert colour[y, x, 0] > 3 * colour[y, x, 2] > 0
+    rows, columns = np.nonzero(depth < 2)
+    size = 0.2 * (40 if orthographic else 60 / np.sqrt(1.5**2 - 0.2**2))
+    assert abs(np.ptp(columns) + 1 - 2 * size) <= 1.5
+    assert np.allclose([columns.mean() + 0.5, rows.mean() + 0.5], pixels[0], atol=0.6)
+
+
+def test_soups_are_gathered_again_only_for_other_shapes():
+    keep = Gatherer()
+    one, other = ball((0, 0, 2), (1, 0, 0)), ball((0, 0, 3), (0, 1, 0))
+    soup = keep([one, other])
+    moved = Solid(one.shape, np.diag([2.0, 2, 2, 1]), np.float32([[0, 0, 1]]))
+    assert keep([moved, other]) is soup
+    assert keep([other, one]) is not soup
+    assert soup.owner.max() == 1
+    assert soup.triangles.max() == len(soup.vertices) - 1
+    camera = view()
+    for kept, fresh in zip(
+        picture([moved, other], camera, soup), picture([moved, other], camera), strict=True
+    ):
+        np.testing.assert_array_equal(kept, fresh)
+
+
+def test_each_pixel_shows_what_is_nearer():
+    """A half transparent avatar 2 m away; solids before it, behind it, and none."""
+    rgba = np.tile(np.float32([1, 1, 1, 0.5]), (1, 4, 1))
+    rgba[0, 3] = 0
+    depth = np.float32([[2, 2, 2, np.inf]])
+    solid = np.float32([[[0.5, 0, 0]] * 4])
+    away = np.float32([[1, 3, np.inf, 3]])
+    whole, distance = compose(rgba, depth, solid, away, (0, 0, 1))
+    np.testing.assert_allclose(whole[0, 0], [0.5, 0, 0, 1])
+    np.testing.assert_allclose(whole[0, 1], [0.75, 0.5, 0.5, 1])
+    np.testing.assert_allclose(whole[0, 2], [0.5, 0.5, 1, 1])
+    np.testing.assert_allclose(whole[0, 3], [0.5, 0, 0, 1])
+    np.testing.assert_array_equal(distance, [[1, 2, 2, 3]])
+    clear, _ = compose(rgba, depth, solid, away, None)
+    np.testing.assert_allclose(clear[0, 2], [0.5, 0.5, 0.5, 0.5])
+
+
+def test_samples_smooth_edges_or_enlarge():
+    rgba = np.float32([[[1, 1, 1, 1]]])
+    depth = np.float32([[2]])
+    colour = np.zeros((2, 2, 3), np.float32)
+    away = np.float32([[1, 3], [np.inf, 3]])
+    assert np.isinf(farthest(away, 2)).all()
+    whole, _ = compose(rgba, depth, colour, away, None)
+    np.testing.assert_allclose(whole[0, 0], [0.75, 0.75, 0.75, 1])
+    large, distance = compose(rgba, depth, colour, away, None, enlarged=True)
+    np.testing.assert_allclose(large[..., 0], [[0, 1], [1, 1]])
+    np.testing.assert_array_equal(distance, [[1, 2], [2, 2]])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from ..structures import Lights, Soup
+from ..soup import Lights, Soup
 from .threads import run_chunks
 
 _BAND = 16  # rows
@@ -30,7 +30,7 @@ def draw(
     count = len(soup.triangles)
     if count == 0:
         return colour, depth
-    points = np.empty((len(soup.vertices), 4))
+    points = np.empty((len(soup.vertices), 6))  # X, Y, W, depth; X / W, Y / W
     boxes = np.empty((count, 4), np.int32)
     index = np.full((height, width), -1, np.int32)
     run_chunks(_project, len(points), _CHUNK, soup.vertices, soup.owner, matrices, points)
@@ -52,6 +52,8 @@ def _project(start, stop, vertices, owner, matrices, points):  # type: ignore[no
         x, y, z = vertices[i, 0], vertices[i, 1], vertices[i, 2]
         for k in range(4):
             points[i, k] = m[k, 0] * x + m[k, 1] * y + m[k, 2] * z + m[k, 3]
+        points[i, 4] = points[i, 0] / points[i, 2] if points[i, 2] != 0 else 0.0
+        points[i, 5] = points[i, 1] / points[i, 2] if points[i, 2] != 0 else 0.0
 
 
 @njit(cache=True, nogil=True)
@@ -62,7 +64,7 @@ def _bound(start, stop, points, triangles, width, height, near, boxes):  # type:
         for i in range(3):
             p, q = points[triangles[t, i]], points[triangles[t, (i + 1) % 3]]
             if p[3] > near:
-                x, y = p[0] / p[2], p[1] / p[2]
+                x, y = p[4], p[5]
                 left, right, top, bottom = min(left, x), max(right, x), min(top, y), max(bottom, y)
             if (p[3] > near) != (q[3] > near):  # where the side passes the nearest depth
                 s = (near - p[3]) / (q[3] - p[3])
@@ -133,8 +135,9 @@ def _fill(start, stop, begins, sorted_, boxes, points, triangles, near, depth, i
         for y in range(max(boxes[t, 1], start * _BAND), min(boxes[t, 3] + 1, stop * _BAND)):
             py = y + 0.5
             ar, br, cr = ay * py + aw, by * py + bw, cy * py + cw
-            low, high = float(x0), float(x1)
+            first, last = x0, x1
             if x1 - x0 >= _WIDE:
+                low, high = float(x0), float(x1)
                 for slope, rest in ((ax, ar), (bx, br), (cx, cr)):
                     if slope > 0:
                         low = max(low, -rest / slope - 1.5)
@@ -142,11 +145,12 @@ def _fill(start, stop, begins, sorted_, boxes, points, triangles, near, depth, i
                         high = min(high, -rest / slope + 0.5)
                 if not low <= high:
                     continue
-            for x in range(int(np.floor(low)), int(np.ceil(high)) + 1):
+                first, last = max(x0, int(low)), min(x1, int(high) + 1)
+            for x in range(first, last + 1):
                 px = x + 0.5
                 u, v, w = ax * px + ar, bx * px + br, cx * px + cr
                 total = u + v + w
-                if u < 0 or v < 0 or w < 0 or not total > 0 or x < x0 or x > x1:
+                if u < 0 or v < 0 or w < 0 or not total > 0:
                     continue
                 z = np.float32((u * a[3] + v * b[3] + w * c[3]) / total)
                 if z < depth[y, x] and z > near:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from ..structures import Lights, Soup
+from ..soup import Lights, Soup
 
 _AT_ONCE = 64  # triangles
 
