@@ -264,7 +264,7 @@ def run(args: argparse.Namespace) -> int:
     if not args.fps > 0:
         raise InputError(f"--fps {args.fps}: above 0")
     collection, clip = parse_track(args.track)
-    with _blender():
+    with blender():
         made = build_scene(
             args.avatar,
             collection,
@@ -304,7 +304,7 @@ def _scene() -> Any:
     return bpy.context.scene
 
 
-class _blender:
+class blender:
     """An empty Blender file with the add-on registered; on the bpy wheel it is unregistered on
     the way out, for a class left registered hangs or crashes that process at its end."""
 

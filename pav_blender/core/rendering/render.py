@@ -184,6 +184,8 @@ def render_scene(
     counting = threading.Lock()
     limits = None if limit is None else np.asarray(limit, np.float32).reshape(-1)
     with torch.inference_mode(), torch_alone():
+        if _compiled(scene, settings):
+            scene.known, scene.packed  # noqa: B018  once, not by every thread
         order = tiled(camera.width, camera.height)
         count = len(order)
         rgba = np.zeros((count, 4), np.float32)
@@ -234,8 +236,7 @@ def _trace(
     scene: Scene, rays: RayBatch, settings: RenderSettings
 ) -> tuple[np.ndarray, np.ndarray, int]:
     """Straight RGBA [R, 4], depth along the camera's axis [R], and how many densities it took."""
-    compiled = settings.skip and scene.avatar.field.device.type == "cpu"
-    run = _whole if compiled else _by_waves
+    run = _whole if _compiled(scene, settings) else _by_waves
     *found, evaluations = run(scene, rays, settings)
     colour, depth, left = (values.cpu() for values in found)
     opacity = 1 - left
@@ -247,6 +248,10 @@ def _trace(
     rgba = torch.where(seen[:, None], torch.cat([straight, alpha[:, None]], 1), 0.0)
     along = torch.where(seen, depth / safe[:, 0] * rays.cosine, torch.inf)
     return rgba.numpy(), along.numpy(), evaluations
+
+
+def _compiled(scene: Scene, settings: RenderSettings) -> bool:
+    return settings.skip and scene.avatar.field.device.type == "cpu"
 
 
 def _whole(scene: Scene, rays: RayBatch, settings: RenderSettings) -> Traced:

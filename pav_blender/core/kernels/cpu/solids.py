@@ -57,20 +57,34 @@ def _project(start, stop, vertices, owner, matrices, points):  # type: ignore[no
 
 
 @njit(cache=True, nogil=True)
+def _clipped(points, corners, near):  # type: ignore[no-untyped-def]
+    """Left, top, right and bottom of the part of a triangle that is farther than `near`."""
+    left, top, right, bottom = np.inf, np.inf, -np.inf, -np.inf
+    for i in range(3):
+        p, q = points[corners[i]], points[corners[(i + 1) % 3]]
+        if p[3] > near:
+            x, y = p[4], p[5]
+            left, right, top, bottom = min(left, x), max(right, x), min(top, y), max(bottom, y)
+        if (p[3] > near) != (q[3] > near):  # where the side passes the nearest depth
+            s = (near - p[3]) / (q[3] - p[3])
+            w = p[2] + s * (q[2] - p[2])
+            x, y = (p[0] + s * (q[0] - p[0])) / w, (p[1] + s * (q[1] - p[1])) / w
+            left, right, top, bottom = min(left, x), max(right, x), min(top, y), max(bottom, y)
+    return left, top, right, bottom
+
+
+@njit(cache=True, nogil=True)
 def _bound(start, stop, points, triangles, width, height, near, boxes):  # type: ignore[no-untyped-def]
     """Columns and rows (x0, y0, x1, y1, all within) that triangles may cover; x0 > x1 for none."""
     for t in range(start, stop):
-        left, top, right, bottom = np.inf, np.inf, -np.inf, -np.inf
-        for i in range(3):
-            p, q = points[triangles[t, i]], points[triangles[t, (i + 1) % 3]]
-            if p[3] > near:
-                x, y = p[4], p[5]
-                left, right, top, bottom = min(left, x), max(right, x), min(top, y), max(bottom, y)
-            if (p[3] > near) != (q[3] > near):  # where the side passes the nearest depth
-                s = (near - p[3]) / (q[3] - p[3])
-                w = p[2] + s * (q[2] - p[2])
-                x, y = (p[0] + s * (q[0] - p[0])) / w, (p[1] + s * (q[1] - p[1])) / w
-                left, right, top, bottom = min(left, x), max(right, x), min(top, y), max(bottom, y)
+        a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
+        if points[a, 3] > near and points[b, 3] > near and points[c, 3] > near:
+            left = min(points[a, 4], points[b, 4], points[c, 4])
+            right = max(points[a, 4], points[b, 4], points[c, 4])
+            top = min(points[a, 5], points[b, 5], points[c, 5])
+            bottom = max(points[a, 5], points[b, 5], points[c, 5])
+        else:
+            left, top, right, bottom = _clipped(points, triangles[t], near)
         boxes[t, 0], boxes[t, 2] = 1, 0
         if left < width and right > 0 and top < height and bottom > 0:
             boxes[t, 0] = int(np.ceil(max(left, 0.0) - 0.5 - _SLACK))
