@@ -137,13 +137,13 @@ def scene_camera(engine: Any, camera: Any, depsgraph: Any, width: int, height: i
 
 def find_actors(depsgraph: Any, shown: Callable[[Any], bool] | None = None) -> tuple[Actor, ...]:
     """Every visible object (or instance of one) that has an avatar file, ready to draw. shown:
-    whether an original object is to be seen."""
+    whether an evaluated object is to be seen."""
     actors = []
     for instance in depsgraph.object_instances:
         evaluated = instance.object
         if evaluated.type == "MESH" and evaluated.pav.avatar and instance.show_self:
             owner = instance.parent if instance.is_instance else evaluated
-            if shown is None or shown(owner.original):
+            if shown is None or shown(owner):
                 actors.append(read_actor(evaluated, instance.matrix_world, depsgraph))
     return tuple(actors)
 

@@ -77,7 +77,7 @@ class Copies:
 
     def collect(self, depsgraph: Any, shown: Callable[[Any], bool]) -> tuple[Solid, ...]:
         """Every visible mesh (or what has one: text, curves, metaballs, instances) but heads that
-        wear an avatar, and those drawn as wires or bounds. shown: whether an original object is to
+        wear an avatar, and those drawn as wires or bounds. shown: whether an evaluated object is to
         be seen. Colours are the materials' viewport colours."""
         changed = {u.id.original.as_pointer() for u in depsgraph.updates if u.is_updated_geometry}
         known: dict[tuple[int, int], _Copy] = {}
@@ -89,7 +89,7 @@ class Copies:
                 continue
             if evaluated.display_type in _OUTLINED:
                 continue
-            if not shown(instance.parent.original if instance.is_instance else evaluated.original):
+            if not shown(instance.parent if instance.is_instance else evaluated):
                 continue
             copy = self._copy(evaluated, changed, known)
             if copy is not None and len(copy.shape.triangles):

@@ -78,8 +78,8 @@ class View:
         solids = self.solids
         self.seen = hiding(space)
 
-        def shown(original: Any) -> bool:
-            return space is None or original.visible_in_viewport_get(space)
+        def shown(evaluated: Any) -> bool:
+            return space is None or evaluated.visible_in_viewport_get(space)
 
         try:
             requirements.check()

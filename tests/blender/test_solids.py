@@ -17,7 +17,7 @@ from pav_blender.core.rendering.cameras import Camera
 from pav_blender.core.rendering.solids import picture
 
 
-def collect(copies=None, shown=lambda original: True):
+def collect(copies=None, shown=lambda evaluated: True):
     bpy.context.view_layer.update()
     return (copies or solids.Copies()).collect(bpy.context.evaluated_depsgraph_get(), shown)
 
@@ -84,7 +84,7 @@ def test_all_that_has_a_mesh_is_seen_once_and_nothing_else(scene, tmp_path):
     assert len(collect()) == 7
     rig.mesh.pav.avatar = ""
     assert len(collect()) == 8
-    assert len(collect(shown=lambda original: original.name != "seen")) == 7
+    assert len(collect(shown=lambda evaluated: evaluated.name != "seen")) == 7
 
 
 def test_only_what_changed_is_copied_again(scene, monkeypatch):
@@ -99,7 +99,7 @@ def test_only_what_changed_is_copied_again(scene, monkeypatch):
 
     def update(_scene, depsgraph):
         """As the engine is told: while Blender still knows what changed."""
-        found[:] = copies.collect(depsgraph, lambda original: True)
+        found[:] = copies.collect(depsgraph, lambda evaluated: True)
 
     def updated():
         bpy.context.view_layer.update()

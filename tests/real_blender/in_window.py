@@ -8,11 +8,11 @@ then Blender quits.
 
 from __future__ import annotations
 
-import gc
 import json
 import sys
 import time
 import traceback
+import weakref
 from pathlib import Path
 
 import addon_utils
@@ -23,6 +23,7 @@ from mathutils import Quaternion
 PACKAGE = "bl_ext.user_default.pav_blender"
 ANSWER, LIMIT = Path(sys.argv[sys.argv.index("--") + 1]), float(sys.argv[-1])
 seen: dict[str, object] = {"drawn": 0, "widths": [], "messages": []}
+known: weakref.WeakSet = weakref.WeakSet()  # every View that was drawn and is still there
 begun = time.monotonic()
 
 
@@ -38,6 +39,8 @@ def watch():
     def view_draw(self, context, depsgraph):
         real(self, context, depsgraph)
         seen["drawn"] += 1
+        if self.view is not None:
+            known.add(self.view)
         if self.view is not None and self.view.pixels is not None:
             seen["widths"].append(self.view.pixels.display.shape[1])
             if self.view.message not in seen["messages"]:
@@ -68,7 +71,7 @@ def shade(kind):
 
 
 def views():
-    return [thing for thing in gc.get_objects() if type(thing).__name__ == "View"]
+    return list(known)
 
 
 def finest():
