@@ -226,7 +226,7 @@ def cut_by_plane(avatar, pose, limit, step=1e-3):
                          wave=600, clearance=scene.clearance, band=reach)  # fmt: skip
         packed, _ = pack(wave, half, step)
         samples = samples_of(packed, scene.clearance, 0, scene.condition, rays, scene.stance)
-        sigma, rgb = avatar.field(samples, scene.worn)
+        sigma, rgb = avatar.field(samples, scene.wearing.worn)
         along = packed.t * rays.cosine[packed.ray.long()]
         sigma = torch.where(
             along <= torch.from_numpy(limit).reshape(-1)[packed.ray.long()], sigma, 0
