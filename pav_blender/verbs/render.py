@@ -28,6 +28,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--size", type=int, help="longer side in pixels (default: the clip's)")
     parser.add_argument("--frames", metavar="A-B", help="frame numbers, e.g. 10-20 or 5")
     parser.add_argument("--depth", action="store_true", help="write EXR with depth (.exr)")
+    parser.add_argument(
+        "--format", help="png8, png16 or exr (default: as --out ends, a .png of 8 bits)"
+    )
     parser.add_argument("--quality", default="final", help="preview, final or reference")
     parser.add_argument("--device", default="cpu", help="of the networks: cpu, cuda or mps")
 
@@ -52,6 +55,7 @@ def run(args: argparse.Namespace) -> int:
         frames=args.frames,
         depth=args.depth,
         quality=args.quality,
+        format=args.format,
         device=args.device,
         progress=progress,
     )
@@ -64,7 +68,7 @@ def _render_blend(args: argparse.Namespace, progress: Progress) -> int:
     from ..core.errors import InputError
     from ..core.rendering.sequence import check_pattern
 
-    taken = [name for name in ("track", "size", "frames", "depth") if getattr(args, name)]
+    taken = [name for name in ("track", "size", "frames", "depth", "format") if getattr(args, name)]
     taken += ["device"] * (args.device != "cpu")
     if taken:
         raise InputError(f"--{taken[0]} does not go with a .blend: it is set in the scene")
