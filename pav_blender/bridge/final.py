@@ -11,8 +11,9 @@ import bpy
 import numpy as np
 
 from ..core.errors import Cancelled, PavError
-from . import requirements, turns
-from .render import Pixels, draw
+from . import requirements, reuse, turns
+from .render import Pixels
+from .reuse import draw
 from .shot import Shot, read_shot
 
 _asked: list[str] = []  # the scene whose render was asked for, from start to end
@@ -86,3 +87,4 @@ def unregister() -> None:
     bpy.app.handlers.render_complete.remove(_ended)
     bpy.app.handlers.render_init.remove(_started)
     _ended()
+    reuse.forget()
