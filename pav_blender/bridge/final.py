@@ -10,7 +10,7 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ..core.errors import Cancelled, PavError
+from ..core.errors import Cancelled, InputError, PavError
 from . import requirements, reuse, turns
 from .render import Pixels
 from .reuse import draw
@@ -27,6 +27,7 @@ def render(engine: Any, depsgraph: Any) -> None:
     try:
         requirements.check()
         shot = read_shot(engine, depsgraph)
+        _check_size(engine, depsgraph, shot)
         engine.update_stats("", f"PAV: {shot.camera.width}x{shot.camera.height}")
         with turns.first():
             pixels = draw(shot, engine.update_progress, engine.test_break)
@@ -39,6 +40,19 @@ def render(engine: Any, depsgraph: Any) -> None:
         _fail(engine, depsgraph, str(error))
         return
     _write(engine, depsgraph.view_layer_eval, shot, pixels)
+
+
+def _check_size(engine: Any, depsgraph: Any, shot: Shot) -> None:
+    """A scene nested in another's compositing is asked for a picture of the outer one's size."""
+    asked, found = (
+        (engine.resolution_x, engine.resolution_y),
+        (shot.camera.width, shot.camera.height),
+    )
+    if asked != found:
+        raise InputError(
+            f"scene {depsgraph.scene_eval.name!r} renders {found[0]}x{found[1]} pixels and is "
+            f"composited into a picture of {asked[0]}x{asked[1]}: give both scenes the same size"
+        )
 
 
 def _write(engine: Any, layer: Any, shot: Shot, pixels: Pixels) -> None:

@@ -10,17 +10,16 @@ import numpy as np
 
 from ..core.errors import InputError
 from ..core.rendering.colour import linear_premultiplied
+from ..core.rendering.frames import EMPTY_DEPTH
 from . import avatars
 from .looks import worn
 from .shot import Actor, Shot
-
-FAR = 1e10  # Blender's depth where nothing is
 
 
 @dataclass(frozen=True, eq=False)
 class Pixels:
     """combined [H, W, 4] scene-linear premultiplied; depth [H, W] metres along the camera's
-    axis, FAR where empty; display [H, W, 4] straight sRGB. Row 0 is the top."""
+    axis, EMPTY_DEPTH where nothing is; display [H, W, 4] straight sRGB. Row 0 is the top."""
 
     combined: np.ndarray
     depth: np.ndarray
@@ -98,7 +97,7 @@ def _draw_actor(
         should_stop=should_stop,
         expression=expression_vector(actor, avatar.expression_names),
     )
-    depth = np.where(np.isfinite(picture.depth), picture.depth * actor.scale, FAR)
+    depth = np.where(np.isfinite(picture.depth), picture.depth * actor.scale, EMPTY_DEPTH)
     return np.asarray(picture.rgba, np.float32), depth.astype(np.float32)
 
 
