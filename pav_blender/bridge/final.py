@@ -11,7 +11,7 @@ import bpy
 import numpy as np
 
 from ..core.errors import Cancelled, InputError, PavError
-from . import requirements, reuse, turns
+from . import compositing, requirements, reuse, turns
 from .render import Pixels
 from .reuse import draw
 from .shot import Shot, read_shot
@@ -26,6 +26,7 @@ def render(engine: Any, depsgraph: Any) -> None:
     """
     try:
         requirements.check()
+        _check_engine(depsgraph.scene_eval.original)
         shot = read_shot(engine, depsgraph)
         _check_size(engine, depsgraph, shot)
         engine.update_stats("", f"PAV: {shot.camera.width}x{shot.camera.height}")
@@ -40,6 +41,16 @@ def render(engine: Any, depsgraph: Any) -> None:
         _fail(engine, depsgraph, str(error))
         return
     _write(engine, depsgraph.view_layer_eval, shot, pixels)
+
+
+def _check_engine(scene: Any) -> None:
+    """A scene whose heads another one renders for its compositor must not draw them itself."""
+    heads = compositing.head_scene(scene)
+    if heads is not None:
+        raise InputError(
+            f"scene {scene.name!r} is composited with its heads, which {heads.name!r} renders: its "
+            "own engine must be Cycles or EEVEE (on a command line leave out `-E PAV`)"
+        )
 
 
 def _check_size(engine: Any, depsgraph: Any, shot: Shot) -> None:

@@ -225,6 +225,19 @@ def test_what_cannot_be_composited_is_told(scene, files):
     assert bpy.context.object.visible_camera
 
 
+def test_pav_as_the_outer_engine_is_refused(made, scene, tmp_path):
+    """`-E PAV` on a composited file: it would show the heads alone, and end well."""
+    composite()
+    scene.render.engine = "PAV"
+    scene.frame_end = scene.frame_start
+    scene.render.filepath = str(tmp_path) + "/"
+    with pytest.raises(RuntimeError, match="leave out `-E PAV`"):
+        bpy.ops.render.render(animation=True)
+    assert list(tmp_path.iterdir()) == []
+    composite()
+    assert picture(tmp_path / "a.png")[..., 3].max() == 255
+
+
 def test_a_nested_scene_of_another_size_is_an_error(made, scene):
     class Engine:
         resolution_x, resolution_y = 100, 40

@@ -124,3 +124,12 @@ def test_a_composited_scene_without_its_avatar_ends_with_code_1(blender, files):
     assert done.returncode == 1, done.stdout + done.stderr
     assert "small.pav: no such avatar file" in done.stdout + done.stderr
     assert list((ROOT / folder).glob("*.png")) == []
+    # a machine without the add-on, as docs/farm.md has it
+    check = "import bpy; assert hasattr(bpy.types.Scene, 'pav'), 'no PAV'"
+    guarded = ("--python-exit-code", "1", "--python-expr", check, "-o", f"{folder}/####", "-a")
+    done = blender("-b", "--factory-startup", path, *guarded)
+    assert done.returncode == 1, done.stdout + done.stderr
+    assert list((ROOT / folder).glob("*.png")) == []
+    done = blender("-b", path, *guarded)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert len(list((ROOT / folder).glob("*.png"))) == 1
