@@ -34,6 +34,12 @@ def composite(scene: Any, engine: str) -> Any:
     heads = heads_of(scene)
     if not heads:
         raise InputError(f"scene {scene.name!r} has no head with an avatar")
+    for head in heads:
+        if head.library is not None:
+            raise InputError(
+                f"object {head.name!r} is linked from {head.library.filepath}: make a library "
+                "override of it first (its camera visibility is switched off)"
+            )
     if scene.camera is None:
         raise InputError(f"scene {scene.name!r} has no camera; add one or import a track")
     tree = _tree(scene)
@@ -144,9 +150,9 @@ def _ends(tree: Any, scene: Any) -> tuple[Any, Any]:
     if end is None:
         end = tree.nodes.new(output)
         end.location = 400, 200
-    if _VERSION_5 and "Image" not in end.inputs:
+    if _VERSION_5 and not any(socket.type == "RGBA" for socket in end.inputs):
         tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
-    target = end.inputs["Image"]
+    target = next(socket for socket in end.inputs if socket.type == "RGBA")
     if not target.is_linked:
         tree.links.new(layers.outputs["Image"], target)
     return layers, target

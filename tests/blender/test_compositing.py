@@ -238,6 +238,25 @@ def test_pav_as_the_outer_engine_is_refused(made, scene, tmp_path):
     assert picture(tmp_path / "a.png")[..., 3].max() == 255
 
 
+def test_a_linked_head_is_told_and_an_override_of_it_taken(made, scene, files, tmp_path):
+    bpy.ops.wm.save_as_mainfile(filepath=str(files / "library.blend"), copy=True)
+    bpy.ops.wm.read_homefile(use_factory_startup=True, use_empty=True)
+    scene = bpy.context.scene
+    with bpy.data.libraries.load(str(files / "library.blend"), link=True) as (_, wanted):
+        wanted.objects = ["small", "small camera"]
+    for thing in wanted.objects:
+        scene.collection.objects.link(thing)
+    scene.camera = wanted.objects[1]
+    with pytest.raises(RuntimeError, match="make a library override"):
+        bpy.ops.pav.composite()
+    assert len(bpy.data.scenes) == 1
+    head = wanted.objects[0].override_create(remap_local_usages=True)
+    assert head.library is None
+    bpy.ops.pav.composite()
+    assert not head.visible_camera
+    assert scene.render.engine != "PAV"  # the scene's own stays
+
+
 def test_a_nested_scene_of_another_size_is_an_error(made, scene):
     class Engine:
         resolution_x, resolution_y = 100, 40
