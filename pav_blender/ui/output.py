@@ -55,7 +55,7 @@ class PAV_PT_render(bpy.types.Panel):
         layout.prop(context.scene.pav, "quality")
         layout.prop(context.scene.render, "film_transparent")
         if not view.is_standard(context.scene):
-            layout.label(text="The view changes the avatar's colours", icon="ERROR")
+            layout.label(text="The view changes colours", icon="ERROR")
             layout.operator("pav.use_standard_view")
 
 
