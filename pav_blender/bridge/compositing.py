@@ -58,19 +58,19 @@ def composite(scene: Any, engine: str) -> Any:
 def separate(scene: Any) -> None:
     """Undoes `composite`: the compositor shows what it did before. InputError where there is
     nothing to undo."""
-    inner = head_scene(scene)
-    tree = _tree_of(scene)
-    nodes = [tree.nodes.get(name) for name in (NODE_JOIN, NODE_HEADS)] if tree else []
-    if inner is None and not any(nodes):
+    inner, tree = head_scene(scene), _tree_of(scene)
+    nodes = tree.nodes if tree is not None else {}
+    join, heads = nodes.get(NODE_JOIN), nodes.get(NODE_HEADS)
+    if inner is None and join is None:
         raise InputError(f"scene {scene.name!r} is not composited with its heads")
-    join = nodes[0] if nodes else None
-    if join is not None:
+    if tree is not None and join is not None:
         before = [link.from_socket for link in join.inputs["Scene"].links]
         after = [link.to_socket for link in join.outputs["Image"].links]
         for socket in after if before else ():
             tree.links.new(before[0], socket)
-    for node in filter(None, nodes):
-        tree.nodes.remove(node)
+        tree.nodes.remove(join)
+    if tree is not None and heads is not None:
+        tree.nodes.remove(heads)
     for head in heads_of(scene):
         head.visible_camera = True
     if inner is not None:
@@ -87,25 +87,24 @@ def head_scene(scene: Any) -> Any | None:
 
 
 def _head_scene(scene: Any, heads: list[Any]) -> Any:
-    """Made, or brought up to date. Size, border and pixel aspect it takes from `scene` when it
-    renders (`shot.render_settings`)."""
+    """Made, or brought up to date. Size, border, pixel aspect and quality it takes from `scene`
+    when it renders (`shot.shown_in`)."""
     inner = head_scene(scene)
     if inner is None:
         inner = bpy.data.scenes.new(f"{scene.name} heads")
         inner.pav.frames.shown_in = scene
-    linked = inner.collection.objects
-    wanted = [*heads, scene.camera]
-    for thing in [thing for thing in linked if thing not in wanted]:
-        linked.unlink(thing)
+    wanted, there = [*heads, scene.camera], list(inner.collection.objects)
+    for thing in there:
+        if thing not in wanted:
+            inner.collection.objects.unlink(thing)
     for thing in wanted:
-        if thing.name not in linked:
-            linked.link(thing)
+        if thing not in there:
+            inner.collection.objects.link(thing)
     inner.camera = scene.camera
     inner.frame_start, inner.frame_end = scene.frame_start, scene.frame_end
     inner.render.fps, inner.render.fps_base = scene.render.fps, scene.render.fps_base
     inner.render.engine = ENGINE
     inner.render.film_transparent = True
-    inner.pav.quality = scene.pav.quality
     inner.view_layers[0].use_pass_z = True
     return inner
 

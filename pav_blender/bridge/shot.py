@@ -103,8 +103,8 @@ def film_background(scene: Any) -> tuple[float, float, float] | None:
 
 
 def shown_in(scene: Any) -> Any:
-    """The scene that says what size a picture of `scene` has: itself, or the one that its heads
-    are composited into. InputError where that one looks through another camera."""
+    """The scene whose size, border and quality a picture of `scene` has: itself, or the one that
+    its heads are composited into. InputError where that one looks through another camera."""
     outer = scene.original.pav.frames.shown_in
     if outer is None:
         return scene
@@ -180,8 +180,8 @@ def read_shot(engine: Any, depsgraph: Any) -> Shot:
         raise InputError(f"scene {scene.name!r} has no camera; add one or import a track")
     if scene.render.use_multiview:
         raise InputError("PAV renders one view; switch stereoscopy off")
-    render = shown_in(scene).render
-    width, height = frame_size(render)
+    outer = shown_in(scene)
+    width, height = frame_size(outer.render)
     camera = scene_camera(engine, camera_object, depsgraph, width, height)
     actors = find_actors(depsgraph)
     if not actors:
@@ -192,8 +192,8 @@ def read_shot(engine: Any, depsgraph: Any) -> Shot:
     return Shot(
         actors,
         camera,
-        border(render, width, height),
-        scene.pav.quality.lower(),
+        border(outer.render, width, height),
+        outer.pav.quality.lower(),
         film_background(scene),
     )
 

@@ -206,6 +206,8 @@ def test_twice_gives_the_same_set_up_and_removing_it_what_was_before(made, scene
         shot.shown_in(inner)
     composite()
     assert shot.shown_in(inner) == scene
+    scene.pav.quality = "FINAL"
+    assert sequence.read_frame(inner.name, 3).quality == "final"
     assert set(inner.objects) == {made.mesh, other}
     bpy.ops.pav.separate()
     assert contents() == before
