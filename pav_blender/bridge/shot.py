@@ -178,9 +178,9 @@ def read_shot(engine: Any, depsgraph: Any) -> Shot:
     camera_object = scene.camera
     if camera_object is None:
         raise InputError(f"scene {scene.name!r} has no camera; add one or import a track")
-    if scene.render.use_multiview:
-        raise InputError("PAV renders one view; switch stereoscopy off")
     outer = shown_in(scene)
+    if outer.render.use_multiview:
+        raise InputError("PAV renders one view; switch stereoscopy off")
     width, height = frame_size(outer.render)
     camera = scene_camera(engine, camera_object, depsgraph, width, height)
     actors = find_actors(depsgraph)
