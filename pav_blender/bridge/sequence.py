@@ -103,7 +103,7 @@ class Sequence:
                 return
             files = [actor.avatar.name for actor in shot.actors]
             settings = f"{shot.quality}, {self.format.name}"
-            told = provenance(files, [worn(actor) for actor in shot.actors], frame, settings)
+            told = provenance(files, [worn_names(actor) for actor in shot.actors], frame, settings)
         except Exception as error:
             self.error = _line(error, frame)
             return
@@ -161,15 +161,17 @@ def every_appearance(scene: Any) -> tuple[str, ...]:
 
 
 def wearing(shot: Shot, appearance: str | None) -> Shot:
-    """The shot with every head in an appearance; as it is for None."""
+    """The shot with every head in an appearance alone, without layers; as it is for None."""
     if appearance is None:
         return shot
-    return replace(shot, actors=tuple(replace(a, appearance=appearance) for a in shot.actors))
+    actors = (replace(actor, appearance=appearance, layers=()) for actor in shot.actors)
+    return replace(shot, actors=tuple(actors))
 
 
-def worn(actor: Any) -> str:
-    """What an actor wears, in words."""
-    return str(actor.appearance or avatars.header(actor.avatar)["appearances"][0])
+def worn_names(actor: Any) -> str:
+    """What an actor wears, in words: its appearance, and layers with their weights."""
+    base = str(actor.appearance or avatars.header(actor.avatar)["appearances"][0])
+    return " + ".join([base, *(f"{layer.appearance} {layer.weight:g}" for layer in actor.layers)])
 
 
 def frame_path(folder: Path, frame: int, suffix: str = ".png") -> Path:

@@ -161,6 +161,12 @@ def test_only_frames_whose_inputs_changed_are_drawn_again(made, scene, tmp_path,
     assert again() == (0, 4)
     made.mesh.pav.appearance = "evening"
     assert again() == (0, 4)
+    layer = made.mesh.pav.layers.add()
+    layer.appearance, layer.weight = "morning", 0.5
+    assert again() == (0, 4)
+    assert images.read_metadata(folder / "000003.png")["pav:appearance"] == "evening + morning 0.5"
+    layer.weight = 0.25
+    assert again() == (0, 4)
     scene.pav.frames.format = "PNG16"
     assert again() == (0, 4)
     made.mesh.name = "renamed"  # no part of a picture
