@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import bpy
 
 from . import engine, operators, ui
-from .bridge import jobs, properties
+from .bridge import jobs, links, properties
 
-_parts = (properties, jobs, engine, operators, ui)
+_parts = (properties, links, jobs, engine, operators, ui)
 _commands: list[object] = []
 
 

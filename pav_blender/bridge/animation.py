@@ -38,7 +38,7 @@ def render_blend(
         heads = [thing for thing in scene.objects if thing.type == "MESH" and thing.pav.avatar]
         if not heads:
             raise InputError(f"{blend}: no object in it wears an avatar; see `pav scene`")
-        known = avatars.load(Path(bpy.path.abspath(heads[0].pav.avatar))).appearances
+        known = avatars.load(avatars.path_of(heads[0].pav)).appearances
         names: list[str | None] = [*known] if appearance == "all" else [appearance]
         written: list[Path] = []
         total = len(names) * (scene.frame_end - scene.frame_start + 1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import zlib
 from collections import OrderedDict
 from pathlib import Path
@@ -34,6 +35,57 @@ def resolve(stored: str, library: Any | None = None) -> Path:
             "or choose the avatar again"
         )
     return Path(bpy.path.abspath(stored, library=library))
+
+
+def path_of(pav: Any) -> Path:
+    """The avatar file of an object's `pav` properties: the packed one, where there is one, else the
+    one that its path names. InputError where the path cannot be resolved."""
+    from .packing import unpacked
+
+    if pav.pack.text is not None:
+        return unpacked(pav.pack.text)
+    return resolve(pav.avatar, _library(pav))
+
+
+def own_path(pav: Any) -> bool:
+    """Whether an object's path is its own, not that of the library that it overrides."""
+    return _library(pav) is None
+
+
+def _library(pav: Any) -> Any | None:
+    """The library whose folder an object's path starts at: a library override keeps the path of
+    the object that it overrides until another is chosen."""
+    object_ = pav.id_data.original
+    override = object_.override_library
+    if override is None or override.reference is None:
+        return object_.library
+    reference = override.reference
+    return reference.library if reference.pav.avatar == pav.avatar else None
+
+
+def chosen_number(pav: Any) -> int:
+    """The number of the appearance chosen for an object, also where its file is missing; 0: none
+    was chosen."""
+    if not pav.is_property_set("appearance"):
+        return 0
+    # from Blender 5 on what bpy.props stores is no longer among the custom properties
+    stored = pav.bl_system_properties_get() if hasattr(pav, "bl_system_properties_get") else pav
+    return int(stored.get("appearance", 0))
+
+
+def stored_path(path: Path, blend: str) -> str:
+    """`path` relative to a saved .blend ("//..."), so that both can move together; else absolute.
+
+    Also absolute where no relative path exists (another drive on Windows).
+    """
+    path = path.resolve()
+    if not blend:
+        return str(path)
+    try:
+        relative = os.path.relpath(path, Path(blend).resolve().parent)
+    except ValueError:
+        return str(path)
+    return "//" + relative.replace(os.sep, "/")
 
 
 def load(path: Path) -> Any:

@@ -16,6 +16,7 @@ import numpy as np
 from ..core.errors import InputError
 from ..core.head import HeadModel, head_from_shape_keys
 from .axes import TO_CORE
+from .pose_keys import pose_keys
 from .rig import CORRECTIVE_PREFIX, REGION_PREFIX, find_armature
 
 _SMALLEST, _LARGEST = 0.08, 2.0  # metres from end to end: life size, with or without shoulders
@@ -30,9 +31,10 @@ def head_from_object(
 ) -> HeadModel:
     """The head that a mesh object is, named after it.
 
-    Shape keys become expressions (muted ones are left out). Bones whose vertex groups hold weights
-    become joints, `joints` renaming some (ours -> theirs: {"jaw": "DEF-jaw"}); where several bones
-    have no parent, or vertices no bone, a root is added that holds them. Vertex groups called
+    Shape keys become expressions (muted ones, and a rig's pose keys, are left out). Bones whose
+    vertex groups hold weights become joints, `joints` renaming some (ours -> theirs: {"jaw":
+    "DEF-jaw"}); where several bones have no parent, or vertices no bone, a root is added that holds
+    them. Vertex groups called
     `region.<name>` become regions, `regions` adding others (ours -> theirs). Without UVs xatlas
     makes an atlas.
 
@@ -154,8 +156,9 @@ def _positions(object_: Any) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     if keys is None:
         return _coordinates(mesh.vertices), {}
     offsets = {}
+    turning = pose_keys(object_, find_armature(object_))
     for key in keys.key_blocks:
-        if key == keys.reference_key or key.mute:
+        if key == keys.reference_key or key.mute or key.name in turning:
             continue
         offset = _coordinates(key.data) - _coordinates(key.relative_key.data)
         if key.vertex_group:

@@ -100,7 +100,7 @@ def add_area(object_: Any, name: str) -> str:
 def other_appearances(head: Any) -> list[str]:
     """Appearances of a head's avatar that neither it nor a layer wears yet; all others than its own
     where each is worn."""
-    path = avatars.resolve(head.pav.avatar, head.library)
+    path = avatars.path_of(head.pav)
     names = [name for name in avatars.header(path)["appearances"] if name != head.pav.appearance]
     worn_already = {layer.appearance for layer in head.pav.layers}
     return [name for name in names if name not in worn_already] or names

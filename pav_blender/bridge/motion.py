@@ -10,6 +10,7 @@ import numpy as np
 from ..core.errors import InputError
 from .axes import camera_to_blender
 from .lens import Lens
+from .pose_keys import pose_keys
 from .rig import KEY_LIMIT
 
 
@@ -31,7 +32,7 @@ def apply_motion(
     joint_names: tuple[str, ...],
     motion: Motion,
 ) -> None:
-    """Replaces the animation of a head's shape keys and bones by `motion`."""
+    """Replaces the animation of a head's shape keys and bones by `motion`; pose keys rest at 0."""
     keys = mesh.data.shape_keys
     largest = float(np.abs(motion.expression).max(initial=0.0))
     if largest > KEY_LIMIT:
@@ -41,6 +42,8 @@ def apply_motion(
         )
     # a new action; a driver of a corrective key stays where it is
     _forget_action(keys)
+    for name in pose_keys(mesh, armature):
+        keys.key_blocks[name].value = 0.0
     for name, values in zip(expression_names, motion.expression.T, strict=True):
         _key(keys.key_blocks[name], "value", motion.frames, values[:, None])
     _forget_action(armature)

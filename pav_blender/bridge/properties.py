@@ -30,7 +30,7 @@ def appearance_items(self: Any, _context: Any) -> list[tuple[str, str, str, int,
     """Menu of the appearances of an object's avatar; empty when the file cannot be read."""
     head = self.id_data.pav  # self may be one of its layers
     try:
-        path = avatars.resolve(head.avatar, self.id_data.library) if head.avatar else None
+        path = avatars.path_of(head) if head.avatar else None
         names = tuple(avatars.header(path)["appearances"]) if path else ()
     except (PavError, ImportError):
         path, names = None, ()
@@ -95,6 +95,18 @@ class PavLayer(bpy.types.PropertyGroup):
     )
 
 
+class PavPack(bpy.types.PropertyGroup):
+    """An avatar file inside the .blend, see `packing`."""
+
+    text: bpy.props.PointerProperty(  # type: ignore[valid-type]
+        name="Packed",
+        description="The text that holds the packed avatar file; it is used in place of the path",
+        type=bpy.types.Text,
+        override={"LIBRARY_OVERRIDABLE"},
+        update=_redraw,
+    )
+
+
 class PavObject(bpy.types.PropertyGroup):
     """An object with an avatar file is rendered as that avatar."""
 
@@ -123,9 +135,14 @@ class PavObject(bpy.types.PropertyGroup):
     active_layer: bpy.props.IntProperty(  # type: ignore[valid-type]
         name="Active Layer", min=0, override={"LIBRARY_OVERRIDABLE"}, options=set()
     )
-
+    pack: bpy.props.PointerProperty(  # type: ignore[valid-type]
+        type=PavPack, override={"LIBRARY_OVERRIDABLE"}
+    )
     camera: bpy.props.PointerProperty(  # type: ignore[valid-type]
-        name="Camera", description="The camera of the imported track", type=bpy.types.Object
+        name="Camera",
+        description="The camera of the imported track",
+        type=bpy.types.Object,
+        override={"LIBRARY_OVERRIDABLE"},
     )
 
 
@@ -157,7 +174,7 @@ class PavScene(bpy.types.PropertyGroup):
     frames: bpy.props.PointerProperty(type=PavFrames)  # type: ignore[valid-type]
 
 
-classes = (PavLayer, PavFrames, PavObject, PavScene)
+classes = (PavLayer, PavFrames, PavPack, PavObject, PavScene)
 
 
 def register() -> None:

@@ -1,7 +1,8 @@
 """A head model as Blender objects: a mesh with shape keys and groups, skinned by an armature.
 
 Every bone points up with its local axes along the core's, so a pose's axis-angle is the bone's
-own rotation and the head's translation is the root bone's location.
+own rotation and the head's translation is the root bone's location. Shape keys can turn joints too,
+see `pose_keys`.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..core.head import HeadModel
+from . import materials, pose_keys
 from .axes import points_to_blender
 from .mesh import add_group
 
@@ -32,8 +34,7 @@ class Rig:
 def build_rig(head: HeadModel, betas: np.ndarray, name: str, collection: Any) -> Rig:
     """Builds the head of identity `betas` [B] and links its objects to a Blender `collection`.
 
-    The evaluated mesh equals `head.pose(betas, expression, pose, translation)`, but for heads whose
-    joints follow the expression: bones stay where the identity has them.
+    The evaluated mesh equals `head.pose(betas, expression, pose, translation)`.
     """
     mesh = _build_mesh(head, betas, name, collection)
     armature = _build_armature(head, betas, f"{name} armature", collection)
@@ -45,7 +46,9 @@ def build_rig(head: HeadModel, betas: np.ndarray, name: str, collection: Any) ->
         add_group(mesh, joint, weights)
     for region, members in head.regions.items():
         add_group(mesh, REGION_PREFIX + region, members.astype(np.float32))
+    pose_keys.connect(head, mesh, armature)
     _drive_correctives(head, mesh, armature)
+    materials.paint(head, mesh)
     return Rig(mesh, armature)
 
 
@@ -114,6 +117,7 @@ def _build_armature(head: HeadModel, betas: np.ndarray, name: str, collection: A
     for bone, parent in zip(bones, head.joint_parents, strict=True):
         if parent >= 0:
             bone.parent = bones[parent]
+    pose_keys.add_bones(head, data)
     bpy.ops.object.mode_set(mode="OBJECT")
     view_layer.objects.active = before
     for bone in object_.pose.bones:
@@ -138,16 +142,16 @@ _ROTATION_TERMS = (
 
 
 def _drive_correctives(head: HeadModel, mesh: Any, armature: Any) -> None:
-    """Pose correctives (FLAME's) follow the bones' rotations through drivers."""
+    """Pose correctives (FLAME's) follow the bones' rotations, pose keys and all, by drivers."""
     for index in range(len(head.pose_basis)):
-        joint = head.joint_names[1 + index // 9]
         key = mesh.data.shape_keys.key_blocks[f"{CORRECTIVE_PREFIX}{index:03d}"]
-        driver = key.driver_add("value").driver
-        driver.type = "SCRIPTED"
-        for part, axis in enumerate("wxyz"):
+        driver = pose_keys.add_driver(key, "value")
+        for axis in "wxyz":
             variable = driver.variables.new()
-            variable.name = axis
+            variable.name, variable.type = axis, "TRANSFORMS"
             target = variable.targets[0]
-            target.id = armature
-            target.data_path = f'pose.bones["{joint}"].rotation_quaternion[{part}]'
+            target.id, target.bone_target = armature, head.joint_names[1 + index // 9]
+            target.rotation_mode = "QUATERNION"
+            target.transform_type = f"ROT_{axis.upper()}"
+            target.transform_space = "LOCAL_SPACE"  # with constraints, without the parent's turn
         driver.expression = _ROTATION_TERMS[index % 9]

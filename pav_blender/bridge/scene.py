@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import argparse
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..core.errors import InputError
+from .avatars import stored_path
 from .lens import from_intrinsics
 from .view import use_standard
 
@@ -44,6 +45,8 @@ def build_head(avatar_path: Path, appearance: str | None = None) -> Any:
         head = head_of(avatar)
     except InputError as error:
         raise InputError(f"{avatar_path}: {error}") from error
+    if head.expression_names != avatar.expression_names:  # another version's names for the same
+        head = replace(head, expression_names=avatar.expression_names)
     rig = build_rig(head, avatar.betas, avatar_path.stem, bpy.context.scene.collection)
     rig.mesh.pav.avatar = stored_path(avatar_path, bpy.data.filepath)
     choose_appearance(rig.mesh, avatar.appearances, name)
@@ -78,24 +81,20 @@ def wear_only(mesh: Any, known: list[str], name: str) -> None:
     choose_appearance(mesh, known, name)
 
 
-def stored_path(path: Path, blend: str) -> str:
-    """`path` relative to a saved .blend ("//..."), so that both can move together; else absolute.
-
-    Also absolute where no relative path exists (another drive on Windows).
-    """
-    path = path.resolve()
-    if not blend:
-        return str(path)
-    try:
-        relative = os.path.relpath(path, Path(blend).resolve().parent)
-    except ValueError:
-        return str(path)
-    return "//" + relative.replace(os.sep, "/")
-
-
-def import_track(mesh: Any, collection: Any, clip_name: str, fps: float | None = None) -> Any:
+def import_track(
+    mesh: Any,
+    collection: Any,
+    clip_name: str,
+    fps: float | None = None,
+    *,
+    relative: bool = False,
+    neutral: int | None = None,
+) -> Any:
     """Animates a head object, and a camera of its own, as in a clip of a `Collection`; returns
     the camera, now the scene's.
+
+    relative: the motion from the clip's neutral, as another person's is put on; see
+    `core.collection.relative_clip`, also for `neutral`.
 
     The scene's frame numbers are the clip's own (`frame_id`); frames of held-out cameras are left
     out; between frames everything is linear. Sets the scene's range, size and, if given, rate. The
@@ -103,12 +102,16 @@ def import_track(mesh: Any, collection: Any, clip_name: str, fps: float | None =
     """
     import bpy
 
+    from ..core.collection import relative_clip
     from . import backdrop
     from .motion import Motion, apply_camera, apply_motion
+    from .overrides import check_editable
     from .rig import find_armature
 
     scene = bpy.context.scene
     clip = collection.clip(clip_name)
+    if relative:
+        clip = relative_clip(clip, neutral)
     armature = find_armature(mesh)
     keys = mesh.data.shape_keys
     head = collection.head
@@ -119,6 +122,7 @@ def import_track(mesh: Any, collection: Any, clip_name: str, fps: float | None =
             f"object {mesh.name!r} has no {what}: clip {clip_name!r} moves the head "
             f"{collection.head_name!r}; import that clip's avatar first"
         )
+    check_editable(mesh, armature)
     rows = filmed_rows(clip)
     frames = clip.frame_id[rows].astype(np.float64)
     motion = Motion(clip.expression[rows], clip.pose[rows], clip.translation[rows], frames)
@@ -143,6 +147,17 @@ def import_track(mesh: Any, collection: Any, clip_name: str, fps: float | None =
     return camera
 
 
+def check_person(mesh: Any, collection: Any) -> None:
+    """InputError where a collection was tracked on another person than a head object's avatar, or
+    on another head model."""
+    from ..core.rendering.sequence import check_head, check_identity
+    from . import avatars
+
+    avatar = avatars.load(avatars.path_of(mesh.pav))
+    check_head(avatar, collection)
+    check_identity(avatar, collection, 'tick "Another Person\'s Track" (confirm_identity)')
+
+
 def use_engine(scene: Any) -> None:
     """Settings under which the avatar's colours reach the file as they were learned."""
     scene.render.engine = ENGINE
@@ -162,18 +177,24 @@ def build_scene(
     *,
     appearance: str | None = None,
     fps: float | None = None,
+    relative: bool = False,
+    other_identity: bool = False,
 ) -> SceneObjects:
     """Adds to the current scene an avatar that moves as a clip of a `Collection`, with the clip's
-    camera, size and frames, ready to render. InputError where they do not fit together."""
+    camera, size and frames, ready to render. InputError where they do not fit together, and where
+    the clip is another person's, unless `other_identity` says that this is meant."""
     import bpy
 
-    from ..core.rendering.sequence import check_head
+    from ..core.rendering.sequence import check_head, check_identity
     from . import avatars
 
-    check_head(avatars.load(avatar_path), collection)
+    avatar = avatars.load(avatar_path)
+    check_head(avatar, collection)
+    if not other_identity:
+        check_identity(avatar, collection)
     collection.clip(clip_name)  # a wrong name is told before anything is built
     rig = build_head(avatar_path, appearance)
-    camera = import_track(rig.mesh, collection, clip_name, fps)
+    camera = import_track(rig.mesh, collection, clip_name, fps, relative=relative)
     use_engine(bpy.context.scene)
     return SceneObjects(rig.mesh, rig.armature, camera)
 
@@ -191,7 +212,10 @@ def _track_camera(scene: Any, mesh: Any) -> Any:
     import bpy
 
     camera = mesh.pav.camera
-    if camera is None or camera.name not in scene.objects:
+    linked = camera is not None and any(
+        thing.library or thing.override_library for thing in (camera, camera.data)
+    )
+    if camera is None or linked or camera.name not in scene.objects:
         name = f"{mesh.name} camera"
         camera = bpy.data.objects.new(name, bpy.data.cameras.new(name))
         camera.data.clip_start = 0.01
@@ -218,6 +242,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.blend")
     parser.add_argument("--appearance", metavar="NAME", help="default: the avatar's first")
     parser.add_argument("--fps", type=float, default=25.0, help="frames a second (default 25)")
+    parser.add_argument(
+        "--relative", action="store_true", help="move from the track's neutral, not as it is"
+    )
+    parser.add_argument(
+        "--other-identity", action="store_true", help="yes, the track is another person's"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -234,7 +264,13 @@ def run(args: argparse.Namespace) -> int:
     collection, clip = parse_track(args.track)
     with _blender():
         made = build_scene(
-            args.avatar, collection, clip.name, appearance=args.appearance, fps=args.fps
+            args.avatar,
+            collection,
+            clip.name,
+            appearance=args.appearance,
+            fps=args.fps,
+            relative=args.relative,
+            other_identity=args.other_identity,
         )
         made.mesh.pav.avatar = stored_path(args.avatar, str(args.out))
         first = collection.image_path(clip, int(filmed_rows(clip)[0]))

@@ -161,7 +161,7 @@ def read_actor(evaluated: Any, matrix_world: Any, depsgraph: Any) -> Actor:
         points = np.ascontiguousarray(points @ stretch.T, np.float32)
     return Actor(
         name=original.name,
-        avatar=avatars.resolve(evaluated.pav.avatar, original.library),
+        avatar=avatars.path_of(original.pav),
         appearance=_appearance(evaluated.pav, original.name),
         vertices=points,
         triangles=mesh.triangles(evaluated.data),
@@ -204,7 +204,7 @@ def _appearance(pav: Any, name: str) -> str | None:
         return None
     if pav.appearance:
         return pav.appearance
-    path = avatars.resolve(pav.avatar, pav.id_data.library)
+    path = avatars.path_of(pav)
     known = ", ".join(avatars.header(path)["appearances"])
     raise InputError(
         f"object {name!r}: the appearance chosen there is not in {path}; it has {known}"

@@ -1,8 +1,8 @@
 """Panels: each draws, none computes."""
 
-from . import avatar, motion, output, training
+from . import avatar, files, motion, output, training
 
-modules = (avatar, motion, training, output)
+modules = (avatar, files, motion, training, output)
 
 
 def register() -> None:

@@ -19,6 +19,7 @@ class PAV_PT_track(Sidebar, bpy.types.Panel):
         column.prop(context.scene.pav, "collection")
         column.prop(context.scene.pav, "clip")
         column.operator("pav.import_track", icon="ANIM_DATA")
+        column.operator("pav.import_livelink", icon="IMPORT")
 
 
 classes = (PAV_PT_track,)

@@ -32,6 +32,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--format", help="png8, png16 or exr (default: as --out ends, a .png of 8 bits)"
     )
     parser.add_argument("--quality", default="final", help="preview, final or reference")
+    parser.add_argument(
+        "--relative", action="store_true", help="move from the track's neutral, not as it is"
+    )
+    parser.add_argument(
+        "--other-identity", action="store_true", help="yes, the track is another person's"
+    )
     parser.add_argument("--device", default="cpu", help="of the networks: cpu, cuda or mps")
 
 
@@ -57,6 +63,8 @@ def run(args: argparse.Namespace) -> int:
         quality=args.quality,
         format=args.format,
         device=args.device,
+        relative=args.relative,
+        other_identity=args.other_identity,
         progress=progress,
     )
     print(f"{len(written)} pictures, the last {written[-1]}")
@@ -69,6 +77,7 @@ def _render_blend(args: argparse.Namespace, progress: Progress) -> int:
     from ..core.rendering.sequence import check_pattern
 
     taken = [name for name in ("track", "size", "frames", "depth", "format") if getattr(args, name)]
+    taken += [n for n in ("relative", "other-identity") if getattr(args, n.replace("-", "_"))]
     taken += ["device"] * (args.device != "cpu")
     if taken:
         raise InputError(f"--{taken[0]} does not go with a .blend: it is set in the scene")

@@ -2,6 +2,16 @@
 
 from .model import LABELS, SPLITS, Clip, Collection
 from .reader import read_collection
+from .relative import identity_distance, relative_clip
 from .writer import CollectionWriter
 
-__all__ = ["LABELS", "SPLITS", "Clip", "Collection", "CollectionWriter", "read_collection"]
+__all__ = [
+    "LABELS",
+    "SPLITS",
+    "Clip",
+    "Collection",
+    "CollectionWriter",
+    "identity_distance",
+    "read_collection",
+    "relative_clip",
+]

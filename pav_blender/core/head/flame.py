@@ -95,7 +95,7 @@ def read_flame(files: FlameFiles | Path | str) -> HeadModel:
         )
     arrays = _arrays(files.model, content)
     expressions = arrays["shapedirs"][SHAPES:]
-    names = [f"expression_{number:03d}" for number in range(1, len(expressions) + 1)]
+    names = [f"exp_{number:03d}" for number in range(len(expressions))]
     if files.left_eyelid and files.right_eyelid:
         lids = [read_eyelids(p, VERTICES) for p in (files.left_eyelid, files.right_eyelid)]
         expressions = np.concatenate([expressions, lids])

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..collection import Clip, Collection, read_collection
+from ..collection import Clip, Collection, identity_distance, read_collection, relative_clip
+from ..collection.relative import OTHER_PERSON
 from ..devices import device_of
 from ..errors import InputError
 from ..field.avatar import Avatar
@@ -58,6 +59,20 @@ def check_head(avatar: Avatar, collection: Collection) -> None:
         )
 
 
+def check_identity(
+    avatar: Avatar, collection: Collection, advice: str = "add --other-identity"
+) -> None:
+    """InputError where the track is another person's; `advice`: how to drive with it anyway."""
+    own = collection.head_with(avatar.head_offset).shaped(avatar.betas)
+    distance = identity_distance(collection.head, own, collection.head.shaped(collection.betas))
+    if distance > OTHER_PERSON:
+        raise InputError(
+            f"{collection.path}: tracked on another person, whose face is {1e3 * distance:.1f} mm "
+            f"off the avatar's (up to {1e3 * OTHER_PERSON:g} mm is one person): {advice} to drive "
+            "the avatar with it anyway, best relative to its neutral"
+        )
+
+
 def posed_avatar(
     avatar: Avatar, collection: Collection, clip: Clip, rows: np.ndarray
 ) -> np.ndarray:
@@ -87,18 +102,25 @@ def render_track(
     progress: Report | None = None,
     should_stop: Callable[[], bool] | None = None,
     device: str = "cpu",
+    relative: bool = False,
+    other_identity: bool = False,
 ) -> list[Path]:
     """Renders and writes one picture a frame; returns their paths.
 
     appearance: a name, or "all" with {appearance} in `out`; format: a name in `frames.FORMATS`, by
-    default as `out` ends. The collection's own identity poses the mesh. Raises InputError before
-    anything is written.
+    default as `out` ends. The avatar's own identity poses the mesh. relative: the motion from its
+    neutral, see `relative_clip`; other_identity: another person's track is meant. Raises InputError
+    before anything is written.
     """
     where = device_of(device)
     avatar = Avatar.load(avatar_path)
     avatar.field.to(where)
     collection, clip = parse_track(track)
     check_head(avatar, collection)
+    if not other_identity:
+        check_identity(avatar, collection)
+    if relative:
+        clip = relative_clip(clip)
     names = avatar.appearances if appearance == "all" else [appearance]
     for name in names:
         avatar.appearance_index(name)
