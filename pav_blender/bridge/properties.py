@@ -9,6 +9,7 @@ import bpy
 
 from ..core.errors import PavError
 from . import avatars, thumbnails
+from .frame_settings import PavFrames
 
 QUALITIES = (
     ("PREVIEW", "Preview", "Coarse and fast"),
@@ -170,9 +171,10 @@ class PavScene(bpy.types.PropertyGroup):
         name="Options",
         description="Further options of `pav train`, as on a command line",
     )
+    frames: bpy.props.PointerProperty(type=PavFrames)  # type: ignore[valid-type]
 
 
-classes = (PavLayer, PavPack, PavObject, PavScene)
+classes = (PavLayer, PavFrames, PavPack, PavObject, PavScene)
 
 
 def register() -> None:

@@ -11,17 +11,16 @@ import numpy as np
 from ..core.errors import InputError
 from ..core.rendering import solids as solid_pictures
 from ..core.rendering.colour import linear_premultiplied
+from ..core.rendering.frames import EMPTY_DEPTH
 from . import avatars
 from .looks import worn
 from .shot import Actor, Shot
-
-FAR = 1e10  # Blender's depth where nothing is
 
 
 @dataclass(frozen=True, eq=False)
 class Pixels:
     """combined [H, W, 4] scene-linear premultiplied; depth [H, W] metres along the camera's
-    axis, FAR where empty; display [H, W, 4] straight sRGB. Row 0 is the top."""
+    axis, EMPTY_DEPTH where nothing is; display [H, W, 4] straight sRGB. Row 0 is the top."""
 
     combined: np.ndarray
     depth: np.ndarray
@@ -155,7 +154,7 @@ def _draw_actor(
         progress=progress,
         should_stop=should_stop,
     )
-    depth = np.where(np.isfinite(picture.depth), picture.depth * actor.scale, FAR)
+    depth = np.where(np.isfinite(picture.depth), picture.depth * actor.scale, EMPTY_DEPTH)
     return np.asarray(picture.rgba, np.float32), depth.astype(np.float32)
 
 

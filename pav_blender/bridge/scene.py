@@ -13,6 +13,7 @@ import numpy as np
 from ..core.errors import InputError
 from .avatars import stored_path
 from .lens import from_intrinsics
+from .view import use_standard
 
 ENGINE = "PAV"
 
@@ -166,10 +167,7 @@ def use_engine(scene: Any) -> None:
     if hasattr(settings, "media_type"):  # Blender 5: the formats on offer depend on it
         settings.media_type = "IMAGE"
     settings.file_format, settings.color_mode, settings.color_depth = "PNG", "RGBA", "8"
-    scene.display_settings.display_device = "sRGB"
-    view = scene.view_settings
-    view.view_transform, view.look = "Standard", "None"
-    view.exposure, view.gamma, view.use_curve_mapping = 0.0, 1.0, False
+    use_standard(scene)
 
 
 def build_scene(

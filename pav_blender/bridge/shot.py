@@ -112,12 +112,26 @@ def film_background(scene: Any) -> tuple[float, float, float] | None:
     return None if scene.render.film_transparent else world_colour(scene.world)
 
 
+def shown_in(scene: Any) -> Any:
+    """The scene whose size, border and quality a picture of `scene` has: itself, or the one that
+    its heads are composited into. InputError where that one looks through another camera."""
+    outer = scene.original.pav.frames.shown_in
+    if outer is None:
+        return scene
+    if outer.camera != scene.original.camera:
+        raise InputError(
+            f"scene {scene.name!r} has another camera than {outer.name!r}, where its heads are "
+            "shown; press Composite with Scene there again"
+        )
+    return outer
+
+
 def scene_camera(engine: Any, camera: Any, depsgraph: Any, width: int, height: int) -> Camera:
     """The camera of a final render in world space, core axes.
 
     `engine` is the render engine (it knows the matrix to use), or None outside a render.
     """
-    render = depsgraph.scene.render
+    render = shown_in(depsgraph.scene).render
     projection = np.array(
         camera.calc_matrix_camera(
             depsgraph,
@@ -177,9 +191,10 @@ def read_shot(engine: Any, depsgraph: Any) -> Shot:
     camera_object = scene.camera
     if camera_object is None:
         raise InputError(f"scene {scene.name!r} has no camera; add one or import a track")
-    if scene.render.use_multiview:
+    outer = shown_in(scene)
+    if outer.render.use_multiview:
         raise InputError("PAV renders one view; switch stereoscopy off")
-    width, height = frame_size(scene.render)
+    width, height = frame_size(outer.render)
     camera = scene_camera(engine, camera_object, depsgraph, width, height)
     actors = find_actors(depsgraph)
     if not actors:
@@ -190,8 +205,8 @@ def read_shot(engine: Any, depsgraph: Any) -> Shot:
     return Shot(
         actors,
         camera,
-        border(scene.render, width, height),
-        scene.pav.quality.lower(),
+        border(outer.render, width, height),
+        outer.pav.quality.lower(),
         film_background(scene),
     )
 

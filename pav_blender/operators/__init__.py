@@ -1,8 +1,8 @@
 """Operators: a few lines each over `bridge`."""
 
-from . import avatar, files, jobs, layers, motion, output, training
+from . import avatar, compositing, files, jobs, layers, motion, output, training
 
-modules = (avatar, files, layers, motion, training, output, jobs)
+modules = (avatar, files, layers, motion, training, output, compositing, jobs)
 
 
 def register() -> None:
