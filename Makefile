@@ -32,9 +32,10 @@ extension: $(VENV)/ready
 extension-plain: $(VENV)/ready
 	$(RUN) tools/build_extension.py --out $(OUT)
 
-# BLENDER: an executable or a wrapper, e.g. BLENDER=/opt/blender/blender
+# BLENDER: an executable or a wrapper, e.g. BLENDER=/opt/blender/blender; BLENDER_WINDOW: one with a
+# display (else what needs a window is skipped)
 test-real-blender: $(VENV)/ready extension-plain
-	BLENDER="$(BLENDER)" $(RUN) -m pytest tests/real_blender
+	BLENDER="$(BLENDER)" BLENDER_WINDOW="$(BLENDER_WINDOW)" $(RUN) -m pytest tests/real_blender
 
 $(VENV)/ready: requirements/py311.txt requirements/py313.txt pyproject.toml
 	tools/make_venv.sh $(PYTHON) $(VENV)

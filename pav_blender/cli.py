@@ -22,6 +22,7 @@ VERBS = {
     "check": "validate and summarise a collection, with an overlay picture",
     "train": "train an avatar on a collection",
     "render": "render an avatar along a track to an image sequence",
+    "frames": "find and clear empty, torn and missing frames in folders of pictures",
     "bake": "a textured mesh of an avatar, for programs that cannot run its field",
     "export": "a collection in INSTA's or VHAP's layout, or as posed meshes",
     "head": "a head file out of any Blender mesh with shape keys",

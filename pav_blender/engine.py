@@ -32,11 +32,11 @@ class PavRenderEngine(bpy.types.RenderEngine):
 
     def view_update(self, context: Any, depsgraph: Any) -> None:
         self.view = self.view or viewport.View()
-        self.view.update(depsgraph)
+        self.view.update(depsgraph, context.space_data)
 
     def view_draw(self, context: Any, depsgraph: Any) -> None:
         if self.view is not None:
-            viewport.draw_view(self, self.view, context, depsgraph.scene_eval)
+            viewport.draw_view(self, self.view, context, depsgraph)
 
 
 # Panels of Blender that mean nothing for this engine
@@ -64,6 +64,7 @@ def _shared_panels() -> list[Any]:
 
 def register() -> None:
     final.register()
+    viewport.register()
     bpy.utils.register_class(PavRenderEngine)
     for panel in _shared_panels():
         panel.COMPAT_ENGINES.add(PavRenderEngine.bl_idname)

@@ -10,7 +10,7 @@ from typing import Any
 from ..core.errors import InputError, PavError
 from ..core.progress import Report
 from ..core.rendering.sequence import numbered
-from .scene import _blender, wear_only
+from .scene import blender, wear_only
 
 
 def render_blend(
@@ -25,7 +25,7 @@ def render_blend(
     """
     if not blend.is_file():
         raise InputError(f"{blend}: no such Blender file")
-    with _blender():
+    with blender():
         import bpy
 
         try:

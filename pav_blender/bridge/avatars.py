@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import zlib
 from collections import OrderedDict
@@ -13,6 +14,7 @@ from ..core.errors import InputError
 _KEPT = 4
 _loaded: OrderedDict[tuple[str, int, int], Any] = OrderedDict()
 _headers: dict[str, tuple[tuple[str, int, int], dict[str, Any]]] = {}
+_contents: dict[str, tuple[tuple[str, int, int], str]] = {}
 
 
 def _identity(path: Path) -> tuple[str, int, int]:
@@ -110,10 +112,26 @@ def header(path: Path) -> dict[str, Any]:
     return known[1]
 
 
+def content(path: Path) -> str:
+    """A hash of an avatar file, the same wherever it lies; read again only when it changed.
+    InputError, one line."""
+    key = _identity(path)
+    known = _contents.get(str(path))
+    if known is None or known[0] != key:
+        try:
+            with path.open("rb") as stream:
+                found = hashlib.file_digest(stream, "sha256").hexdigest()
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+        _contents[str(path)] = known = (key, found)
+    return known[1]
+
+
 def forget() -> None:
     """Drops every loaded model."""
     _loaded.clear()
     _headers.clear()
+    _contents.clear()
 
 
 def number(name: str) -> int:

@@ -10,9 +10,10 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ..core.errors import Cancelled, PavError
-from . import requirements, turns
-from .render import Pixels, draw
+from ..core.errors import Cancelled, InputError, PavError
+from . import compositing, requirements, reuse, turns
+from .render import Pixels
+from .reuse import draw
 from .shot import Shot, read_shot
 
 _asked: list[str] = []  # the scene whose render was asked for, from start to end
@@ -25,7 +26,9 @@ def render(engine: Any, depsgraph: Any) -> None:
     """
     try:
         requirements.check()
+        _check_engine(depsgraph.scene_eval.original)
         shot = read_shot(engine, depsgraph)
+        _check_size(engine, depsgraph, shot)
         engine.update_stats("", f"PAV: {shot.camera.width}x{shot.camera.height}")
         with turns.first():
             pixels = draw(shot, engine.update_progress, engine.test_break)
@@ -38,6 +41,29 @@ def render(engine: Any, depsgraph: Any) -> None:
         _fail(engine, depsgraph, str(error))
         return
     _write(engine, depsgraph.view_layer_eval, shot, pixels)
+
+
+def _check_engine(scene: Any) -> None:
+    """A scene whose heads another one renders for its compositor must not draw them itself."""
+    heads = compositing.head_scene(scene)
+    if heads is not None:
+        raise InputError(
+            f"scene {scene.name!r} is composited with its heads, which {heads.name!r} renders: its "
+            "own engine must be Cycles or EEVEE (on a command line leave out `-E PAV`)"
+        )
+
+
+def _check_size(engine: Any, depsgraph: Any, shot: Shot) -> None:
+    """A scene nested in another's compositing is asked for a picture of the outer one's size."""
+    asked, found = (
+        (engine.resolution_x, engine.resolution_y),
+        (shot.camera.width, shot.camera.height),
+    )
+    if asked != found:
+        raise InputError(
+            f"scene {depsgraph.scene_eval.name!r} renders {found[0]}x{found[1]} pixels and is "
+            f"composited into a picture of {asked[0]}x{asked[1]}: give both scenes the same size"
+        )
 
 
 def _write(engine: Any, layer: Any, shot: Shot, pixels: Pixels) -> None:
@@ -86,3 +112,4 @@ def unregister() -> None:
     bpy.app.handlers.render_complete.remove(_ended)
     bpy.app.handlers.render_init.remove(_started)
     _ended()
+    reuse.forget()

@@ -9,6 +9,7 @@ import bpy
 
 from ..core.errors import PavError
 from . import avatars, thumbnails, training_properties
+from .frame_settings import PavFrames
 from .training_properties import PavTraining
 
 QUALITIES = (
@@ -162,10 +163,11 @@ class PavScene(bpy.types.PropertyGroup):
         description="Clip of the collection whose track to import; its first if empty",
         search=clip_names,
     )
+    frames: bpy.props.PointerProperty(type=PavFrames)  # type: ignore[valid-type]
     training: bpy.props.PointerProperty(type=PavTraining)  # type: ignore[valid-type]
 
 
-classes = (*training_properties.classes, PavLayer, PavPack, PavObject, PavScene)
+classes = (*training_properties.classes, PavLayer, PavFrames, PavPack, PavObject, PavScene)
 
 
 def register() -> None:

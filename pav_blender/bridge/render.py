@@ -9,18 +9,18 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import InputError
+from ..core.rendering import solids as solid_pictures
 from ..core.rendering.colour import linear_premultiplied
+from ..core.rendering.frames import EMPTY_DEPTH
 from . import avatars
 from .looks import worn
 from .shot import Actor, Shot
-
-FAR = 1e10  # Blender's depth where nothing is
 
 
 @dataclass(frozen=True, eq=False)
 class Pixels:
     """combined [H, W, 4] scene-linear premultiplied; depth [H, W] metres along the camera's
-    axis, FAR where empty; display [H, W, 4] straight sRGB. Row 0 is the top."""
+    axis, EMPTY_DEPTH where nothing is; display [H, W, 4] straight sRGB. Row 0 is the top."""
 
     combined: np.ndarray
     depth: np.ndarray
@@ -31,14 +31,24 @@ def draw(
     shot: Shot,
     progress: Callable[[float], None] | None = None,
     should_stop: Callable[[], bool] | None = None,
+    posed: Posed | None = None,
 ) -> Pixels:
-    """Renders every actor of a shot, nearer over farther. Raises PavError, one line;
-    Cancelled where `should_stop` said so."""
+    """Renders every actor of a shot, nearer over farther, among its solids. Raises PavError, one
+    line; Cancelled where `should_stop` said so. posed: where poses are kept."""
     count = len(shot.actors)
+    posed = posed or Posed()
+    solids = posed.solids(shot) if shot.solids else None
+    limit = solid_pictures.farthest(solids[1], shot.samples) if solids else None
     layers = []
     for index, actor in enumerate(shot.actors):
-        layers.append(_draw_actor(shot, actor, _part(progress, index, count), should_stop))
-    display, depth = _stack(layers)
+        report = _part(progress, index, count)
+        layers.append(_draw_actor(shot, actor, posed, limit, report, should_stop))
+    display, depth = _stack(layers, shot.region)
+    if solids:
+        combined, depth = solid_pictures.compose(
+            display, depth, *solids, shot.background, enlarged=shot.enlarged
+        )
+        return Pixels(combined, np.minimum(depth, FAR), display)
     combined = linear_premultiplied(display)
     if shot.background is not None:
         combined[..., :3] += (1 - combined[..., 3:]) * np.asarray(shot.background, np.float32)
@@ -74,31 +84,77 @@ def check_topology(actor: Actor, avatar: Any) -> None:
         )
 
 
+class Posed:
+    """Poses of the last actors, and the last solids: while only the camera moves, or a head as a
+    whole, nothing is posed anew. One picture at a time."""
+
+    def __init__(self, kept: int = 0) -> None:
+        self._kept = kept
+        self._scenes: list[tuple[Actor, Any]] = []
+        self._gather = solid_pictures.Gatherer()
+
+    def scene(self, actor: Actor) -> Any:
+        """The actor's avatar in its pose, a `core.rendering.render.Scene`. InputError, one line."""
+        from ..core.rendering.render import pose_scene
+
+        avatar = avatars.load(actor.avatar)
+        for entry in self._scenes:
+            other, scene = entry
+            if scene.avatar is avatar and replace(
+                other, rigid=actor.rigid, scale=actor.scale
+            ).equals(actor):
+                self._scenes.remove(entry)
+                self._scenes.append(entry)
+                return scene
+        check_topology(actor, avatar)
+        scene = pose_scene(
+            avatar,
+            actor.vertices,
+            worn(actor.appearance or avatar.appearances[0], actor.layers),
+            expression_vector(actor, avatar.expression_names),
+        )
+        self._scenes = [*self._scenes, (actor, scene)][-self._kept :] if self._kept else []
+        return scene
+
+    def solids(self, shot: Shot) -> tuple[np.ndarray, np.ndarray]:
+        """Colour and depth of the shot's solids, `samples` along either side of a pixel."""
+        camera = shot.camera.window(*shot.region)
+        fine = camera.resized(camera.width * shot.samples, camera.height * shot.samples)
+        return solid_pictures.picture(shot.solids, fine, self._gather(shot.solids))
+
+    def forget(self) -> None:
+        """Lets go of everything."""
+        self._scenes = []
+        self._gather = solid_pictures.Gatherer()
+
+
 def _draw_actor(
     shot: Shot,
     actor: Actor,
+    posed: Posed,
+    limit: np.ndarray | None,
     progress: Callable[[float], None] | None,
     should_stop: Callable[[], bool] | None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    from ..core.rendering.render import RenderSettings, render
+    import torch
 
-    avatar = avatars.load(actor.avatar)
-    check_topology(actor, avatar)
+    from ..core.kernels.cpu.threads import torch_alone
+    from ..core.rendering.render import RenderSettings, render_scene
+
     settings = RenderSettings.preset(shot.quality)
     if shot.chunk:
         settings = replace(settings, chunk=shot.chunk)
-    picture = render(
-        avatar,
-        actor.vertices,
-        actor.seen_by(shot.camera),
-        worn(actor.appearance or avatar.appearances[0], actor.layers),
+    with torch.inference_mode(), torch_alone():
+        scene = posed.scene(actor)
+    picture = render_scene(
+        scene,
+        actor.seen_by(shot.camera.window(*shot.region)),
         settings,
-        region=shot.region,
+        limit=None if limit is None else limit / np.float32(actor.scale),
         progress=progress,
         should_stop=should_stop,
-        expression=expression_vector(actor, avatar.expression_names),
     )
-    depth = np.where(np.isfinite(picture.depth), picture.depth * actor.scale, FAR)
+    depth = np.where(np.isfinite(picture.depth), picture.depth * actor.scale, EMPTY_DEPTH)
     return np.asarray(picture.rgba, np.float32), depth.astype(np.float32)
 
 
@@ -110,8 +166,13 @@ def _part(
     return lambda fraction: progress((index + fraction) / count)
 
 
-def _stack(layers: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+def _stack(
+    layers: list[tuple[np.ndarray, np.ndarray]], region: tuple[int, int, int, int]
+) -> tuple[np.ndarray, np.ndarray]:
     """Straight pictures with depths -> one, each pixel's nearer layer over the farther."""
+    if not layers:
+        shape = region[3] - region[1], region[2] - region[0]
+        return np.zeros((*shape, 4), np.float32), np.full(shape, FAR, np.float32)
     if len(layers) == 1:
         return layers[0]
     order = np.argsort([depth for _, depth in layers], axis=0, kind="stable")

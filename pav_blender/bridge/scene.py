@@ -13,6 +13,7 @@ import numpy as np
 from ..core.errors import InputError
 from .avatars import stored_path
 from .lens import from_intrinsics
+from .view import use_standard
 
 ENGINE = "PAV"
 
@@ -166,10 +167,7 @@ def use_engine(scene: Any) -> None:
     if hasattr(settings, "media_type"):  # Blender 5: the formats on offer depend on it
         settings.media_type = "IMAGE"
     settings.file_format, settings.color_mode, settings.color_depth = "PNG", "RGBA", "8"
-    scene.display_settings.display_device = "sRGB"
-    view = scene.view_settings
-    view.view_transform, view.look = "Standard", "None"
-    view.exposure, view.gamma, view.use_curve_mapping = 0.0, 1.0, False
+    use_standard(scene)
 
 
 def build_scene(
@@ -264,7 +262,7 @@ def run(args: argparse.Namespace) -> int:
     if not args.fps > 0:
         raise InputError(f"--fps {args.fps}: above 0")
     collection, clip = parse_track(args.track)
-    with _blender():
+    with blender():
         made = build_scene(
             args.avatar,
             collection,
@@ -304,7 +302,7 @@ def _scene() -> Any:
     return bpy.context.scene
 
 
-class _blender:
+class blender:
     """An empty Blender file with the add-on registered; on the bpy wheel it is unregistered on
     the way out, for a class left registered hangs or crashes that process at its end."""
 

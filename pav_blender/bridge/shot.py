@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 
 from ..core.errors import InputError
 from ..core.rendering.cameras import Camera
+from ..core.rendering.solids import Solid
 from . import avatars, mesh
 from .axes import camera_to_core
 from .lens import frame_size, from_projection
@@ -49,6 +51,10 @@ class Actor:
         """A camera of the world as it stands to the head's own space."""
         pose = np.linalg.inv(self.rigid) @ camera.camera_to_world
         pose[:3, 3] /= self.scale
+        if camera.parallel:  # its intrinsics count pixels a metre
+            scale = np.diag([self.scale, self.scale, 1.0])
+            intrinsics = np.hstack([(scale @ camera.intrinsics)[:, :2], camera.intrinsics[:, 2:]])
+            return replace(camera, camera_to_world=pose, intrinsics=intrinsics)
         return replace(camera, camera_to_world=pose)
 
 
@@ -56,7 +62,8 @@ class Actor:
 class Shot:
     """One picture: the `region` (x0, y0, x1, y1) of what `camera` (world, core axes) sees,
     top-left origin; quality: a preset's name; background: scene-linear RGB, None for a transparent
-    film; chunk: rays between two looks at whether to stop, 0 for the renderer's own."""
+    film; chunk: rays between two looks at whether to stop, 0 for the renderer's own; solids: what
+    else is seen, with samples x samples of it a pixel, each a pixel of its own if `enlarged`."""
 
     actors: tuple[Actor, ...]
     camera: Camera
@@ -64,6 +71,9 @@ class Shot:
     quality: str
     background: tuple[float, float, float] | None
     chunk: int = 0
+    solids: tuple[Solid, ...] = ()
+    samples: int = 1
+    enlarged: bool = False
 
 
 def border(render: Any, width: int, height: int) -> tuple[int, int, int, int]:
@@ -102,12 +112,26 @@ def film_background(scene: Any) -> tuple[float, float, float] | None:
     return None if scene.render.film_transparent else world_colour(scene.world)
 
 
+def shown_in(scene: Any) -> Any:
+    """The scene whose size, border and quality a picture of `scene` has: itself, or the one that
+    its heads are composited into. InputError where that one looks through another camera."""
+    outer = scene.original.pav.frames.shown_in
+    if outer is None:
+        return scene
+    if outer.camera != scene.original.camera:
+        raise InputError(
+            f"scene {scene.name!r} has another camera than {outer.name!r}, where its heads are "
+            "shown; press Composite with Scene there again"
+        )
+    return outer
+
+
 def scene_camera(engine: Any, camera: Any, depsgraph: Any, width: int, height: int) -> Camera:
     """The camera of a final render in world space, core axes.
 
     `engine` is the render engine (it knows the matrix to use), or None outside a render.
     """
-    render = depsgraph.scene.render
+    render = shown_in(depsgraph.scene).render
     projection = np.array(
         camera.calc_matrix_camera(
             depsgraph,
@@ -125,13 +149,16 @@ def scene_camera(engine: Any, camera: Any, depsgraph: Any, width: int, height: i
     return Camera(width, height, intrinsics, camera_to_core(matrix))
 
 
-def find_actors(depsgraph: Any) -> tuple[Actor, ...]:
-    """Every visible object (or instance of one) that has an avatar file, ready to draw."""
+def find_actors(depsgraph: Any, shown: Callable[[Any], bool] | None = None) -> tuple[Actor, ...]:
+    """Every visible object (or instance of one) that has an avatar file, ready to draw. shown:
+    whether an evaluated object is to be seen."""
     actors = []
     for instance in depsgraph.object_instances:
         evaluated = instance.object
         if evaluated.type == "MESH" and evaluated.pav.avatar and instance.show_self:
-            actors.append(read_actor(evaluated, instance.matrix_world, depsgraph))
+            owner = instance.parent if instance.is_instance else evaluated
+            if shown is None or shown(owner):
+                actors.append(read_actor(evaluated, instance.matrix_world, depsgraph))
     return tuple(actors)
 
 
@@ -164,9 +191,10 @@ def read_shot(engine: Any, depsgraph: Any) -> Shot:
     camera_object = scene.camera
     if camera_object is None:
         raise InputError(f"scene {scene.name!r} has no camera; add one or import a track")
-    if scene.render.use_multiview:
+    outer = shown_in(scene)
+    if outer.render.use_multiview:
         raise InputError("PAV renders one view; switch stereoscopy off")
-    width, height = frame_size(scene.render)
+    width, height = frame_size(outer.render)
     camera = scene_camera(engine, camera_object, depsgraph, width, height)
     actors = find_actors(depsgraph)
     if not actors:
@@ -177,8 +205,8 @@ def read_shot(engine: Any, depsgraph: Any) -> Shot:
     return Shot(
         actors,
         camera,
-        border(scene.render, width, height),
-        scene.pav.quality.lower(),
+        border(outer.render, width, height),
+        outer.pav.quality.lower(),
         film_background(scene),
     )
 

@@ -104,9 +104,9 @@ def _take() -> float | None:
     """On the main thread: drawn pictures become icons."""
     global _previews
     if _previews is None:
-        import bpy.utils.previews
+        from bpy.utils import previews
 
-        _previews = bpy.utils.previews.new()
+        _previews = previews.new()
     over = not _wanted  # asked before the drawn ones are taken: none is left behind
     fresh = bool(_drawn)
     while _drawn:

@@ -11,7 +11,7 @@ import threading
 import time
 import weakref
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import bpy
@@ -19,32 +19,46 @@ import numpy as np
 
 from ..core.errors import Cancelled, PavError
 from ..core.rendering.cameras import Camera
+from ..core.rendering.solids import Solid
 from . import requirements, turns
-from .axes import camera_to_core
-from .lens import from_projection
-from .render import Pixels, draw
+from .render import Pixels, Posed, draw
 from .shot import Actor, Shot, film_background, find_actors
+from .sight import view_border, view_camera
+from .solids import Copies
 
-ORTHO_DISTANCE = 50.0  # metres; from there a perspective view is as good as a parallel one
 _COARSE_S = 0.06  # what the first picture of a new view may take, while the user waits for it
 _CHUNK = 2048
 _POLL_S = 1 / 30
+_PATIENCE_S = 10.0  # for the thread to notice that it is to end
 _SHARES = (1 / 8, 1 / 4, 1 / 2, 1)  # of the view's sides
+_SAMPLES = (4, 2, 1, 2)  # solids cost little: finer than the avatar, and at last smooth
 
 _waiting: list[weakref.ref[View]] = []  # guarded by turns.changed
 _finished = threading.Event()
 _drawing = threading.Lock()  # one picture at a time: the renderer uses every core for each
+_posed = Posed(kept=4)  # guarded by _drawing; views of one scene share it
 _rate = 20_000.0  # pixels a second, as measured
 _warm = False  # torch and the kernels are loaded: many seconds the first time, never in front
 _thread: threading.Thread | None = None
+_stopping = False
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A picture in the share with this number in _SHARES; None, and why, where there is none."""
+
+    pixels: Pixels | None
+    message: str
+    share: int
 
 
 @dataclass(eq=False)
 class View:
     """The state of one rendered 3D view. `shot` is what it should show, `pixels` what it has,
-    `share` the number in _SHARES of the next picture."""
+    `share` the number in _SHARES of the next picture, `seen` what its settings hide."""
 
     actors: tuple[Actor, ...] = ()
+    solids: tuple[Solid, ...] = ()
     background: tuple[float, float, float] | None = None
     shot: Shot | None = None
     pixels: Pixels | None = None
@@ -53,80 +67,105 @@ class View:
     shown: Pixels | None = None
     texture: Any = None
     share: int = 0
+    seen: object = None
+    copies: Copies = field(default_factory=Copies)
 
-    def update(self, depsgraph: Any) -> None:
-        """Takes a copy of what is to be drawn. Blender calls this for every edit of the file; one
-        that does not concern the picture changes nothing."""
+    def update(self, depsgraph: Any, space: Any = None) -> None:
+        """Takes a copy of what is to be drawn, as the 3D view `space` shows it. Blender calls this
+        for every edit of the file; one that does not concern the picture changes nothing."""
         message = ""
         actors: tuple[Any, ...] = ()
+        solids = self.solids
+        self.seen = hiding(space)
+
+        def shown(evaluated: Any) -> bool:
+            return space is None or evaluated.visible_in_viewport_get(space)
+
         try:
             requirements.check()
-            actors = find_actors(depsgraph)
+            solids = self.copies.collect(depsgraph, shown)
+            actors = find_actors(depsgraph, shown)
             if not actors:
                 message = "No avatar in view: choose an avatar file in the PAV tab"
-        except PavError as error:
-            message = str(error)
+        except Exception as error:
+            message = _explained(error)
         background = film_background(depsgraph.scene_eval)
-        alike = len(actors) == len(self.actors) and all(
-            one.equals(other) for one, other in zip(actors, self.actors, strict=True)
-        )
-        if alike and background == self.background and not (message or self.message):
+        same_actors = _equal(actors, self.actors)
+        told = message == self.message if not actors else not self.message
+        if same_actors and told and _equal(solids, self.solids) and background == self.background:
             return
-        self.actors, self.background, self.message = actors, background, message
+        if not same_actors:
+            self.actors = actors
+        self.solids, self.background, self.message = solids, background, message
         self.changed = True
 
     def look(self, camera: Camera) -> None:
         """Brings the picture to the camera: nothing if it has it, else the coarse one now and the
         finer ones later."""
-        if not self.actors:
+        if not (self.actors or self.solids):
             self.shot = self.pixels = None
             return
         if not self.changed and self.shot is not None and _same(self.shot.camera, camera):
             return
         self.changed = False
         whole = (0, 0, camera.width, camera.height)
-        self.shot = Shot(self.actors, camera, whole, "preview", self.background, _CHUNK)
+        self.shot = Shot(
+            self.actors, camera, whole, "preview", self.background, _CHUNK, self.solids
+        )
         self.share = 0
         if _warm:
-            self.share = _coarsest(camera)
             with turns.first(), _drawing:
-                self.take(self.shot, *_draw(self.shot, self.share, lambda: False))
+                self.take(self.shot, _draw(self.shot, None, lambda: False))
         else:
             self.message = "Loading"
         if self.share < len(_SHARES):
             _ask(weakref.ref(self))
 
-    def take(self, shot: Shot, pixels: Pixels | None, message: str) -> None:
+    def take(self, shot: Shot, outcome: Outcome) -> None:
         """Accepts a picture (or what went wrong) if it still shows what it should."""
         if shot is not self.shot:
             return
-        self.message = message
-        if pixels is not None:
-            self.pixels = pixels
-            self.share += 1
+        if outcome.message or shot.actors:
+            self.message = outcome.message
+        if outcome.pixels is not None:
+            self.pixels, self.share = outcome.pixels, outcome.share + 1
         else:
             self.share = len(_SHARES)  # no finer picture will go better
 
 
-def _draw(shot: Shot, share: int, should_stop: Callable[[], bool]) -> tuple[Pixels | None, str]:
-    """A share of a shot's pixels, or what went wrong. Cancelled where `should_stop` said so."""
+def _draw(shot: Shot, share: int | None, should_stop: Callable[[], bool]) -> Outcome:
+    """A share of a shot's pixels, or what went wrong; None: the finest share that is ready soon
+    enough to be waited for. Cancelled where `should_stop` said so."""
     global _rate, _warm
-    part = _SHARES[share]
-    camera = shot.camera.resized(
-        max(1, round(shot.camera.width * part)), max(1, round(shot.camera.height * part))
-    )
-    region = (0, 0, camera.width, camera.height)
     begun = time.perf_counter()
     try:
-        pixels = draw(replace(shot, camera=camera, region=region), should_stop=should_stop)
+        for actor in shot.actors:
+            _posed.scene(actor)  # kept: what follows costs by the pixel
+        posed = time.perf_counter()
+        if share is None:
+            share = _coarsest(shot.camera, _COARSE_S - (posed - begun))
+        pixels = draw(_shared(shot, share), should_stop=should_stop, posed=_posed)
     except Cancelled:
         raise
     except Exception as error:
-        return None, str(error) or type(error).__name__
+        return Outcome(None, _explained(error), share or 0)
     if _warm:
-        _rate = camera.width * camera.height / max(time.perf_counter() - begun, 1e-4)
+        _rate = pixels.display[..., 0].size / max(time.perf_counter() - posed, 1e-4)
     _warm = True
-    return pixels, ""
+    return Outcome(pixels, "", share)
+
+
+def _shared(shot: Shot, share: int) -> Shot:
+    """The shot with a share of its pixels."""
+    width, height = (max(1, round(n * _SHARES[share])) for n in shot.region[2:])
+    samples = _SAMPLES[share] if shot.solids else 1
+    return replace(
+        shot,
+        camera=shot.camera.resized(width, height),
+        region=(0, 0, width, height),
+        samples=samples,
+        enlarged=_SHARES[share] < 1,
+    )
 
 
 def refine(owner: weakref.ref[View]) -> None:
@@ -147,14 +186,16 @@ def _refine_once(owner: weakref.ref[View]) -> bool:
     del view
     try:
         with _drawing:
-            outcome = _draw(shot, share, lambda: turns.wanted() or not _current(owner, shot))
+            outcome = _draw(
+                shot, share, lambda: _stopping or turns.wanted() or not _current(owner, shot)
+            )
     except Cancelled:
         if _current(owner, shot):
             _ask(owner)
         return False
     view = owner()
     if view is not None:
-        view.take(shot, *outcome)
+        view.take(shot, outcome)
     return view is not None
 
 
@@ -163,44 +204,44 @@ def _current(owner: weakref.ref[View], shot: Shot) -> bool:
     return view is not None and view.shot is shot
 
 
-def view_camera(region: Any, region_data: Any) -> Camera:
-    """The camera of a 3D view in core axes; a parallel view is seen from far away."""
-    matrix = np.array(region_data.view_matrix.inverted())
-    projection = np.array(region_data.window_matrix)
-    width, height = region.width, region.height
-    if region_data.is_perspective or abs(projection[3, 2] + 1) < 1e-6:
-        intrinsics = from_projection(projection, width, height)
-        return Camera(width, height, intrinsics, camera_to_core(matrix))
-    intrinsics = np.array(
-        [
-            [projection[0, 0] * width / 2 * ORTHO_DISTANCE, 0, (1 + projection[0, 3]) * width / 2],
-            [
-                0,
-                projection[1, 1] * height / 2 * ORTHO_DISTANCE,
-                (1 - projection[1, 3]) * height / 2,
-            ],
-            [0, 0, 1],
-        ]
-    )
-    focus = np.array(region_data.view_location)
-    back = matrix[:3, 2]
-    # the plane through the point that the view turns about keeps its size
-    matrix[:3, 3] += back * (ORTHO_DISTANCE - back @ (matrix[:3, 3] - focus))
-    return Camera(width, height, intrinsics, camera_to_core(matrix))
-
-
-def draw_view(engine: Any, view: View, context: Any, scene: Any) -> None:
+def draw_view(engine: Any, view: View, context: Any, depsgraph: Any) -> None:
     """Called inside Blender's drawing: puts the newest picture into the 3D view."""
+    region, region_data, space = context.region, context.region_data, context.space_data
+    scene = depsgraph.scene_eval
+    if not bpy.app.timers.is_registered(_poll):
+        bpy.app.timers.register(_poll, persistent=True)
+    if view.seen != hiding(space):  # Blender tells nobody that something is shown alone now
+        view.update(depsgraph, space)
+    x0, y0, x1, y1 = view_border(region, region_data, space, scene)
+    if x0 == x1:
+        return
+    try:
+        view.look(view_camera(region, region_data).window(x0, y0, x1, y1))
+    except PavError as error:
+        view.message, view.pixels = str(error), None
+    engine.update_stats("PAV", view.message)
+    if view.pixels is not None:
+        _show(engine, view, view.pixels, scene, (x0, region.height - y1, x1 - x0, y1 - y0))
+
+
+def hiding(space: Any) -> object:
+    """What of a 3D view's settings decides which objects it shows."""
+    if space is None:
+        return None
+    return (
+        space.local_view is not None,
+        space.use_local_collections,
+        space.show_object_viewport_mesh,
+    )
+
+
+def _show(
+    engine: Any, view: View, pixels: Pixels, scene: Any, place: tuple[int, int, int, int]
+) -> None:
     import gpu
     from gpu_extras.presets import draw_texture_2d
 
-    view.look(view_camera(context.region, context.region_data))
-    if not bpy.app.timers.is_registered(_poll):
-        bpy.app.timers.register(_poll, persistent=True)
-    engine.update_stats("PAV", view.message)
-    pixels = view.pixels
-    if pixels is None:
-        return
+    x, y, across, up = place
     if pixels is not view.shown:
         height, width = pixels.depth.shape
         flat = np.ascontiguousarray(pixels.combined[::-1], np.float32).ravel()
@@ -209,23 +250,33 @@ def draw_view(engine: Any, view: View, context: Any, scene: Any) -> None:
         view.shown = pixels
     gpu.state.blend_set("ALPHA_PREMULT")
     engine.bind_display_space_shader(scene)
-    draw_texture_2d(view.texture, (0, 0), context.region.width, context.region.height)
+    draw_texture_2d(view.texture, (x, y), across, up)
     engine.unbind_display_space_shader()
     gpu.state.blend_set("NONE")
 
 
-def _coarsest(camera: Camera) -> int:
-    """The finest picture that is ready soon enough to be waited for."""
-    affordable = _rate * _COARSE_S
+def _coarsest(camera: Camera, seconds: float) -> int:
+    """The finest picture that takes no longer; the coarsest where none does."""
+    affordable = _rate * seconds
     fitting = [
         i for i, part in enumerate(_SHARES) if camera.width * camera.height * part**2 <= affordable
     ]
     return fitting[-1] if fitting else 0
 
 
+def _explained(error: Exception) -> str:
+    return str(error) or type(error).__name__
+
+
+def _equal(some: tuple[Any, ...], others: tuple[Any, ...]) -> bool:
+    return len(some) == len(others) and all(
+        one.equals(other) for one, other in zip(some, others, strict=True)
+    )
+
+
 def _same(one: Camera, other: Camera) -> bool:
     return (
-        (one.width, one.height) == (other.width, other.height)
+        (one.width, one.height, one.parallel) == (other.width, other.height, other.parallel)
         and np.allclose(one.intrinsics, other.intrinsics, atol=1e-4)
         and np.allclose(one.camera_to_world, other.camera_to_world, atol=1e-7)
     )
@@ -234,19 +285,23 @@ def _same(one: Camera, other: Camera) -> bool:
 def _ask(owner: weakref.ref[View]) -> None:
     global _thread
     with turns.changed:
+        if _stopping:
+            return
         if owner not in _waiting:
             _waiting.append(owner)
         turns.changed.notify_all()
-    if _thread is None:
-        _thread = threading.Thread(target=_work, daemon=True)
-        _thread.start()
+        if _thread is None:
+            _thread = threading.Thread(target=_work, name="pav viewport", daemon=True)
+            _thread.start()
 
 
 def _work() -> None:
     while True:
         with turns.changed:
-            while not _waiting or turns.wanted():
+            while not _stopping and (not _waiting or turns.wanted()):
                 turns.changed.wait()
+            if _stopping:
+                return
             owner = _waiting.pop(0)
         refine(owner)
 
@@ -261,8 +316,21 @@ def _poll() -> float:
     return _POLL_S
 
 
+def register() -> None:
+    global _stopping
+    _stopping = False
+
+
 def unregister() -> None:
+    """The thread ends before its code goes; Blender unregisters add-ons when it quits, too."""
+    global _stopping, _thread
     if bpy.app.timers.is_registered(_poll):
         bpy.app.timers.unregister(_poll)
     with turns.changed:
+        _stopping = True
         _waiting.clear()
+        turns.changed.notify_all()
+    if _thread is not None:
+        _thread.join(_PATIENCE_S)
+        _thread = None
+    _posed.forget()

@@ -86,6 +86,38 @@ def read_scene_linear(path: Path | str) -> np.ndarray:
     return np.nan_to_num(np.ascontiguousarray(pixels[..., :4], np.float32))
 
 
+def check(path: Path | str) -> None:
+    """Reads a picture, every part of it, to its end. InputError for a missing or damaged file."""
+    oiio = _oiio()
+    source = oiio.ImageInput.open(str(path)) if Path(path).is_file() else None
+    if source is None:
+        raise InputError(f"{path}: not a readable picture ({_first_line(oiio.geterror())})")
+    try:
+        part = 0
+        while source.seek_subimage(part, 0):
+            channels = source.spec().nchannels
+            pixels = source.read_image(part, 0, 0, channels, str(source.spec().format))
+            if pixels is None or source.has_error:
+                problem = _first_line(source.geterror())
+                raise InputError(f"{path}: the picture is damaged ({problem})")
+            part += 1
+        source.geterror()  # that there is no further part
+    finally:
+        source.close()
+
+
+def read_metadata(path: Path | str) -> dict[str, str]:
+    """The texts that a picture carries, by name. InputError where its head cannot be read."""
+    oiio = _oiio()
+    source = oiio.ImageInput.open(str(path)) if Path(path).is_file() else None
+    if source is None:
+        raise InputError(f"{path}: not a readable picture ({_first_line(oiio.geterror())})")
+    try:
+        return {item.name: str(item.value) for item in source.spec().extra_attribs}
+    finally:
+        source.close()
+
+
 def read_gray(path: Path | str) -> np.ndarray:
     """Reads the first channel as it is stored: uint8, uint16 or float32, [H, W]."""
     pixels = _read(path, "native")

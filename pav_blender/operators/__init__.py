@@ -1,8 +1,8 @@
 """Operators: a few lines each over `bridge`."""
 
-from . import avatar, files, jobs, layers, motion, output, setup, training
+from . import avatar, compositing, files, jobs, layers, motion, output, setup, training
 
-modules = (avatar, files, layers, motion, training, output, jobs, setup)
+modules = (avatar, files, layers, motion, training, output, compositing, jobs, setup)
 
 
 def register() -> None:

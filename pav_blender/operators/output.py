@@ -12,7 +12,7 @@ from .reporting import reporting
 
 
 class PAV_OT_write_sequence(bpy.types.Operator):
-    """Write the scene's frames as PNG into the output folder; frames already there are kept"""
+    """Write the scene's frames into the output folder; keep those whose inputs did not change"""
 
     bl_idname = "pav.write_sequence"
     bl_label = "Write Frames"

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 import bpy
 
-from ..bridge import jobs
+from ..bridge import compositing, jobs, view
 from .shared import Sidebar, draw_job, draw_missing
 
 
@@ -18,9 +18,22 @@ class PAV_PT_frames(Sidebar, bpy.types.Panel):
         column = self.layout.column()
         column.use_property_split = True
         column.prop(context.scene.pav, "quality")
+        column.prop(context.scene.pav.frames, "format")
+        column.prop(context.scene.pav.frames, "appearances")
         column.prop(context.scene.render, "filepath", text="Folder")
         column.operator("pav.write_sequence", icon="RENDER_ANIMATION")
         draw_job(column, jobs.WRITING)
+        _draw_compositing(column, context.scene)
+
+
+def _draw_compositing(layout: Any, scene: Any) -> None:
+    outer = scene.pav.frames.shown_in
+    if outer is not None:
+        layout.label(text=f"Heads of the scene {outer.name}", icon="NODE_COMPOSITING")
+        return
+    layout.operator("pav.composite", icon="NODE_COMPOSITING")
+    if compositing.head_scene(scene) is not None:
+        layout.operator("pav.separate", icon="X")
 
 
 class PAV_PT_render(bpy.types.Panel):
@@ -41,9 +54,9 @@ class PAV_PT_render(bpy.types.Panel):
         draw_missing(layout)
         layout.prop(context.scene.pav, "quality")
         layout.prop(context.scene.render, "film_transparent")
-        if context.scene.view_settings.view_transform != "Standard":
-            layout.label(text="Set the view transform to Standard,", icon="ERROR")
-            layout.label(text="or the avatar's colours change", icon="BLANK1")
+        if not view.is_standard(context.scene):
+            layout.label(text="The view changes colours", icon="ERROR")
+            layout.operator("pav.use_standard_view")
 
 
 classes = (

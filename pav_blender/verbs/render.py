@@ -28,6 +28,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--size", type=int, help="longer side in pixels (default: the clip's)")
     parser.add_argument("--frames", metavar="A-B", help="frame numbers, e.g. 10-20 or 5")
     parser.add_argument("--depth", action="store_true", help="write EXR with depth (.exr)")
+    parser.add_argument(
+        "--format", help="png8, png16 or exr (default: as --out ends, a .png of 8 bits)"
+    )
     parser.add_argument("--quality", default="final", help="preview, final or reference")
     parser.add_argument(
         "--relative", action="store_true", help="move from the track's neutral, not as it is"
@@ -58,6 +61,7 @@ def run(args: argparse.Namespace) -> int:
         frames=args.frames,
         depth=args.depth,
         quality=args.quality,
+        format=args.format,
         device=args.device,
         relative=args.relative,
         other_identity=args.other_identity,
@@ -72,7 +76,7 @@ def _render_blend(args: argparse.Namespace, progress: Progress) -> int:
     from ..core.errors import InputError
     from ..core.rendering.sequence import check_pattern
 
-    taken = [name for name in ("track", "size", "frames", "depth") if getattr(args, name)]
+    taken = [name for name in ("track", "size", "frames", "depth", "format") if getattr(args, name)]
     taken += [n for n in ("relative", "other-identity") if getattr(args, n.replace("-", "_"))]
     taken += ["device"] * (args.device != "cpu")
     if taken:

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -21,12 +23,12 @@ def camera(seed=0, width=64, height=48):
 
 
 @settings(max_examples=50, deadline=None)
-@given(st.integers(0, 10_000), st.floats(0.1, 5.0))
-def test_a_ray_through_a_pixel_projects_back_into_it(seed, distance):
-    view = camera(seed)
+@given(st.integers(0, 10_000), st.floats(0.1, 5.0), st.booleans())
+def test_a_ray_through_a_pixel_projects_back_into_it(seed, distance, parallel):
+    view = replace(camera(seed), parallel=parallel)
     x, y = np.array([0, 10, 63]), np.array([0, 47, 20])
-    directions, cosine = view.directions(x, y)
-    points = view.origin + directions.astype(np.float64) * distance
+    origins, directions, cosine = view.rays(x, y)
+    points = origins.astype(np.float64) + directions.astype(np.float64) * distance
     pixels, depth = view.project(points)
     np.testing.assert_allclose(pixels, np.stack([x, y], 1) + 0.5, atol=2e-3)
     np.testing.assert_allclose(depth, distance * cosine, rtol=1e-5)
@@ -64,7 +66,7 @@ def test_the_rasteriser_agrees_with_rays_cast_at_every_pixel():
     vertices, triangles = np.array(mesh.vertices), np.array(mesh.faces)
     depth, index, barycentric = rasterise(vertices, triangles, view)
     y, x = np.indices(depth.shape).reshape(2, -1)
-    directions, cosine = view.directions(x, y)
+    _, directions, cosine = view.rays(x, y)
     expected = np.full(len(x), np.inf)
     corners = vertices[triangles]
     for a, b, c in corners:  # Moeller and Trumbore, one triangle at a time

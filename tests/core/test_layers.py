@@ -10,7 +10,7 @@ import pytest
 PACKAGE = Path(__file__).parents[2] / "pav_blender"
 
 # a folder may import those to its right, and itself
-OUTER = ["ui", "operators", "bridge", "benchmarks", "studio", "core"]
+OUTER = ["ui", "operators", "benchmarks", "bridge", "studio", "core"]
 INNER = [
     {"baking"},
     {"evaluation"},

@@ -204,3 +204,91 @@ def test_a_camera_that_sees_nothing_gives_an_empty_picture(toy_avatar, pose):
     camera = dataclasses.replace(pose["camera"], camera_to_world=away)
     shown = picture(toy_avatar, pose, camera=camera)
     assert not shown.rgba.any()
+
+
+def cut_by_plane(avatar, pose, limit, step=1e-3):
+    """The quadrature over whole rays, of which only samples nearer than `limit` are kept: RGBA
+    before black [H, W, 4]."""
+    import torch
+
+    from pav_blender.core import kernels
+    from pav_blender.core.rendering.rays import camera_rays, pack, samples_of
+
+    camera, ops = pose["camera"], kernels.select("cpu").marching
+    with torch.inference_mode():
+        scene = rendering.pose_scene(avatar, pose["vertices"], "plain", pose["expression"])
+        pixels = np.arange(camera.width * camera.height)
+        rays = camera_rays(camera, pixels % camera.width, pixels // camera.width)
+        half, reach = torch.full((len(rays),), 0.5), avatar.config.reach
+        around = ops.bounds(scene.mesh.vertices, reach, rays.origins, rays.directions)
+        first, last = ops.lattice(*around, half, step)
+        wave = ops.march(scene.mesh, rays.origins, rays.directions, first, last, half, step,
+                         wave=600, clearance=scene.clearance, band=reach)  # fmt: skip
+        packed, _ = pack(wave, half, step)
+        samples = samples_of(packed, scene.clearance, 0, scene.condition, rays, scene.stance)
+        sigma, rgb = avatar.field(samples, scene.wearing.worn)
+        along = packed.t * rays.cosine[packed.ray.long()]
+        sigma = torch.where(
+            along <= torch.from_numpy(limit).reshape(-1)[packed.ray.long()], sigma, 0
+        )
+        colour, opacity, _, _ = kernels.select("cpu", reference=True).marching.composite(
+            sigma, rgb, packed.t, step, packed.ray, len(rays)
+        )
+    found = torch.cat([colour, opacity[:, None]], 1).numpy()
+    return found.reshape(camera.height, camera.width, 4)
+
+
+@pytest.mark.parametrize("stepwise", [False, True])
+def test_a_limit_cuts_the_avatar_as_a_plane_does(toy_avatar, pose, stepwise, monkeypatch):
+    small = pose | {"camera": pose["camera"].resized(32, 32)}
+    scene = rendering.pose_scene(toy_avatar, pose["vertices"], "plain", pose["expression"])
+    if stepwise:
+        monkeypatch.setattr(rendering, "_whole", rendering._by_waves)
+    whole = rendering.render_scene(scene, small["camera"], EVERY)
+    # slanted, through the middle of the face
+    limit = np.float32(np.nanmedian(whole.depth[np.isfinite(whole.depth)]))
+    limit = limit + np.linspace(-0.04, 0.04, 32, dtype=np.float32)[None].repeat(32, 0)
+    cut = rendering.render_scene(scene, small["camera"], EVERY, limit=limit)
+    expected = cut_by_plane(toy_avatar, small, limit)
+    black = cut.rgba[..., :3] * cut.rgba[..., 3:]
+    assert psnr(black, expected[..., :3]) > 46
+    assert np.abs(cut.rgba[..., 3] - expected[..., 3]).max() < 0.03
+    seen = np.isfinite(cut.depth)
+    assert (cut.depth[seen] <= limit[seen]).all()
+    assert 0.2 < seen.sum() / np.isfinite(whole.depth).sum() < 0.9
+    assert cut.evaluations < whole.evaluations
+
+
+def test_a_limit_beyond_everything_changes_nothing_and_one_of_zero_leaves_nothing(toy_avatar, pose):
+    scene = rendering.pose_scene(toy_avatar, pose["vertices"], "plain", pose["expression"])
+    whole = picture(toy_avatar, pose)
+    far = rendering.render_scene(scene, pose["camera"], limit=np.full((64, 64), np.inf))
+    np.testing.assert_array_equal(far.rgba, whole.rgba)
+    none = rendering.render_scene(scene, pose["camera"], limit=np.zeros((64, 64)))
+    assert not none.rgba.any()
+    assert none.evaluations == 0
+
+
+def test_a_parallel_camera_is_a_pinhole_infinitely_far_away(toy_avatar, pose):
+    near = pose["camera"]
+    focal = near.intrinsics[0, 0] / 0.75  # pixels a metre where the face is
+    back, centre = near.camera_to_world[:3, 2], near.camera_to_world[:3, 3]
+    away = 200.0
+    far = near.camera_to_world.copy()
+    far[:3, 3] = centre - (away - 0.75) * back
+    scale = np.array([[focal * away], [focal * away], [1]])
+    pinhole = dataclasses.replace(
+        near,
+        camera_to_world=far,
+        intrinsics=np.hstack([np.diag(scale[:, 0])[:, :2], near.intrinsics[:, 2:]]),
+    )
+    parallel = dataclasses.replace(
+        near,
+        parallel=True,
+        intrinsics=np.hstack([np.diag([focal, focal, 1])[:, :2], near.intrinsics[:, 2:]]),
+    )
+    one, other = (picture(toy_avatar, pose, camera=c) for c in (pinhole, parallel))
+    assert (other.rgba[..., 3] > 0.9).mean() > 0.1
+    assert psnr(over(one.rgba, 1.0), over(other.rgba, 1.0)) > 35
+    seen = np.isfinite(one.depth) & np.isfinite(other.depth) & (other.rgba[..., 3] > 0.9)
+    assert np.median(np.abs(one.depth[seen] - (away - 0.75) - other.depth[seen])) < 1e-3

@@ -1,8 +1,7 @@
 """Two implementations of one interface: `reference` (plain torch, any device) and `cpu` (numba).
 
-Both folders hold the same file names (nearest, encoding, mlp, marching, picking,
-optimiser) with the same
-functions. Code that computes asks for one of them and never names it:
+Both folders hold the same file names (nearest, encoding, mlp, marching, picking, optimiser,
+solids) with the same functions. Code that computes asks for one of them and never names it:
 
 >>> from pav_blender.core.kernels import select
 >>> kernels = select("cpu")
@@ -19,7 +18,7 @@ from typing import Any
 
 _plain = False
 
-MODULES = ("nearest", "encoding", "mlp", "marching", "picking", "optimiser")
+MODULES = ("nearest", "encoding", "mlp", "marching", "picking", "optimiser", "solids")
 
 
 def select(device: Any = "cpu", *, reference: bool = False) -> ModuleType:

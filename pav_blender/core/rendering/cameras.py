@@ -1,4 +1,4 @@
-"""A pinhole camera: intrinsics in pixels, camera-to-world with OpenCV axes."""
+"""A pinhole or parallel camera: intrinsics in pixels, camera-to-world with OpenCV axes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from ..errors import InputError
 class Camera:
     """width, height in pixels; intrinsics [3, 3]; camera_to_world [4, 4], metres.
 
-    x right, y down, z forward; the centre of the first pixel is at (0.5, 0.5).
+    x right, y down, z forward; the centre of the first pixel is at (0.5, 0.5). A `parallel` camera
+    (orthographic) has pixels a metre in place of focal lengths, and rays that begin in its plane.
     Raises InputError for values that are not finite or do not make a camera.
     """
 
@@ -21,6 +22,7 @@ class Camera:
     height: int
     intrinsics: np.ndarray
     camera_to_world: np.ndarray
+    parallel: bool = False
 
     def __post_init__(self) -> None:
         intrinsics = np.asarray(self.intrinsics, np.float64)
@@ -47,21 +49,34 @@ class Camera:
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """World points [N, 3] -> pixels [N, 2] and depth along the camera's z [N], float64."""
         local = (np.asarray(points, np.float64) - self.origin) @ self.camera_to_world[:3, :3]
-        depth = local[:, 2]
-        safe = np.where(np.abs(depth) < 1e-12, 1e-12, depth)
+        depth = local[:, 2].copy()
+        if self.parallel:
+            local[:, 2] = 1.0
+        safe = np.where(np.abs(local[:, 2]) < 1e-12, 1e-12, local[:, 2])
         homogeneous = local @ self.intrinsics.T
         return homogeneous[:, :2] / safe[:, None], depth
 
-    def directions(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pixel columns and rows [N] (integers: their centres) -> unit directions [N, 3] in the
-        world and the cosine to the camera's axis [N] (depth = distance * cosine), float32."""
+    def rays(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Pixel columns and rows [N] (integers: their centres) -> origins and unit directions
+        [N, 3] in the world and the cosine to the camera's axis [N] (depth = distance * cosine),
+        float32."""
         (fx, skew, cx), (_, fy, cy), _ = self.intrinsics
         v = (np.asarray(y, np.float64) + 0.5 - cy) / fy
         u = (np.asarray(x, np.float64) + 0.5 - cx - skew * v) / fx
-        local = np.stack([u, v, np.ones_like(u)], axis=1)
-        length = np.linalg.norm(local, axis=1)
-        world = (local / length[:, None]) @ self.camera_to_world[:3, :3].T
-        return world.astype(np.float32), (1 / length).astype(np.float32)
+        turn = self.camera_to_world[:3, :3].T
+        if self.parallel:
+            origins = self.origin + np.stack([u, v, np.zeros_like(u)], axis=1) @ turn
+            local, length = np.tile([0.0, 0.0, 1.0], (len(u), 1)), np.ones_like(u)
+        else:
+            origins = np.tile(self.origin, (len(u), 1))
+            local = np.stack([u, v, np.ones_like(u)], axis=1)
+            length = np.linalg.norm(local, axis=1)
+        world = (local / length[:, None]) @ turn
+        return (
+            origins.astype(np.float32),
+            world.astype(np.float32),
+            (1 / length).astype(np.float32),
+        )
 
     def resized(self, width: int, height: int) -> Camera:
         """The same view with another number of pixels."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -19,31 +20,36 @@ TILE = 4  # rays go together in squares of pixels: neighbours share triangles an
 
 @dataclass(eq=False)
 class RayBatch:
-    """R rays: origins, directions [R, 3] (unit), cosine [R] (camera depth = t * cosine)."""
+    """R rays: origins, directions [R, 3] (unit), cosine [R] (camera depth = t * cosine), end [R]:
+    metres along each after which nothing is seen, None for no end."""
 
     origins: torch.Tensor
     directions: torch.Tensor
     cosine: torch.Tensor
+    end: torch.Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.cosine)
 
     def to(self, device: torch.device) -> RayBatch:
-        return RayBatch(self.origins.to(device), self.directions.to(device), self.cosine.to(device))
+        return self._each(lambda values: values.to(device))
 
     def pick(self, rows: torch.Tensor) -> RayBatch:
-        return RayBatch(self.origins[rows], self.directions[rows], self.cosine[rows])
+        return self._each(lambda values: values[rows])
+
+    def _each(self, change: Callable[[torch.Tensor], torch.Tensor]) -> RayBatch:
+        end = None if self.end is None else change(self.end)
+        return RayBatch(change(self.origins), change(self.directions), change(self.cosine), end)
 
 
-def camera_rays(camera: Camera, columns: np.ndarray, rows: np.ndarray) -> RayBatch:
-    """Rays through the centres of pixels (columns [R], rows [R])."""
-    directions, cosine = camera.directions(columns, rows)
-    origin = torch.from_numpy(camera.origin.astype(np.float32))
-    return RayBatch(
-        origin.expand(len(columns), 3).contiguous(),
-        torch.from_numpy(directions),
-        torch.from_numpy(cosine),
-    )
+def camera_rays(
+    camera: Camera, columns: np.ndarray, rows: np.ndarray, limit: np.ndarray | None = None
+) -> RayBatch:
+    """Rays through the centres of pixels (columns [R], rows [R]); limit [R]: how far they see,
+    metres along the camera's axis."""
+    origins, directions, cosine = (torch.from_numpy(a) for a in camera.rays(columns, rows))
+    end = None if limit is None else torch.from_numpy(np.asarray(limit, np.float32)) / cosine
+    return RayBatch(origins, directions, cosine, end)
 
 
 @lru_cache(maxsize=8)

@@ -158,13 +158,34 @@ def render(
     (x0, y0, x1, y1), top-left origin. Raises InputError for input that does not fit and Cancelled
     when `should_stop()`.
     """
-    settings = settings or RenderSettings()
     if region is not None:
         camera = camera.window(*region)
-    caller, done, evaluations = threading.get_ident(), 0, 0
-    counting = threading.Lock()
     with torch.inference_mode(), torch_alone():
         scene = pose_scene(avatar, vertices, appearance, expression)
+    return render_scene(scene, camera, settings, progress=progress, should_stop=should_stop)
+
+
+def render_scene(
+    scene: Scene,
+    camera: Camera,
+    settings: RenderSettings | None = None,
+    *,
+    limit: np.ndarray | None = None,
+    progress: Callable[[float], None] | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> Picture:
+    """Renders an avatar that `pose_scene` posed, as often as one likes.
+
+    limit [H, W]: how far each pixel sees, metres along the camera's axis: what lies behind is
+    neither looked at nor shown. Raises Cancelled when `should_stop()`.
+    """
+    settings = settings or RenderSettings()
+    caller, done, evaluations = threading.get_ident(), 0, 0
+    counting = threading.Lock()
+    limits = None if limit is None else np.asarray(limit, np.float32).reshape(-1)
+    with torch.inference_mode(), torch_alone():
+        if _compiled(scene, settings):
+            scene.known, scene.packed  # noqa: B018  once, not by every thread
         order = tiled(camera.width, camera.height)
         count = len(order)
         rgba = np.zeros((count, 4), np.float32)
@@ -177,7 +198,8 @@ def render(
             if ours and should_stop is not None and should_stop():
                 raise Cancelled("rendering was cancelled")
             pixels = order[start:stop]
-            rays = camera_rays(camera, pixels % camera.width, pixels // camera.width)
+            far = None if limits is None else limits[pixels]
+            rays = camera_rays(camera, pixels % camera.width, pixels // camera.width, far)
             with torch.inference_mode():
                 rgba[pixels], depth[pixels], evaluated = _trace(scene, rays, settings)
             with counting:
@@ -214,8 +236,7 @@ def _trace(
     scene: Scene, rays: RayBatch, settings: RenderSettings
 ) -> tuple[np.ndarray, np.ndarray, int]:
     """Straight RGBA [R, 4], depth along the camera's axis [R], and how many densities it took."""
-    compiled = settings.skip and scene.avatar.field.device.type == "cpu"
-    run = _whole if compiled else _by_waves
+    run = _whole if _compiled(scene, settings) else _by_waves
     *found, evaluations = run(scene, rays, settings)
     colour, depth, left = (values.cpu() for values in found)
     opacity = 1 - left
@@ -229,10 +250,15 @@ def _trace(
     return rgba.numpy(), along.numpy(), evaluations
 
 
+def _compiled(scene: Scene, settings: RenderSettings) -> bool:
+    return settings.skip and scene.avatar.field.device.type == "cpu"
+
+
 def _whole(scene: Scene, rays: RayBatch, settings: RenderSettings) -> Traced:
     """The rays in one compiled pass."""
     ops, stance = kernels.select("cpu"), scene.stance
     near, far = ops.marching.bounds(scene.voxels.box, 0.0, rays.origins, rays.directions)
+    far = _ended(far, rays)
     half = torch.full((len(rays),), 0.5)
     first, last = ops.marching.lattice(near, far, half, settings.step)
     turned = rays.directions @ torch.from_numpy(stance.rotation)
@@ -275,7 +301,7 @@ def _by_waves(scene: Scene, rays: RayBatch, settings: RenderSettings) -> Traced:
     jitter = torch.full((count,), 0.5)
     around = (scene.voxels.box, 0.0) if settings.skip else (scene.mesh.vertices, reach)
     near, far = ops.marching.bounds(*around, rays.origins, rays.directions)
-    first, last = ops.marching.lattice(near, far, jitter, settings.step)
+    first, last = ops.marching.lattice(near, _ended(far, rays), jitter, settings.step)
     alive = (last >= first).nonzero()[:, 0]
     while len(alive):
         part = rays.pick(alive)
@@ -316,6 +342,10 @@ def _geometry(
     mixture = Mixture(wearing.mixture.shares.to(device), wearing.mixture.filled.to(device))
     sigma, parts, seen = geometry(field, mixture, wearing.worn, samples)
     return sigma, list(zip(seen, parts.T, strict=True))
+
+
+def _ended(far: torch.Tensor, rays: RayBatch) -> torch.Tensor:
+    return far if rays.end is None else torch.minimum(far, rays.end)
 
 
 def _wave(

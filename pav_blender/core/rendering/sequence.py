@@ -13,11 +13,10 @@ from ..collection.relative import OTHER_PERSON
 from ..devices import device_of
 from ..errors import InputError
 from ..field.avatar import Avatar
-from ..images import write_exr, write_rgba
 from ..progress import Report
 from .cameras import Camera
-from .colour import linear_premultiplied
-from .render import Picture, RenderSettings, render
+from .frames import format_of, provenance, write_frame
+from .render import RenderSettings, render
 
 
 def parse_track(track: str) -> tuple[Collection, Clip]:
@@ -99,6 +98,7 @@ def render_track(
     frames: str | None = None,
     depth: bool = False,
     quality: str = "final",
+    format: str | None = None,
     progress: Report | None = None,
     should_stop: Callable[[], bool] | None = None,
     device: str = "cpu",
@@ -107,9 +107,10 @@ def render_track(
 ) -> list[Path]:
     """Renders and writes one picture a frame; returns their paths.
 
-    appearance: a name, or "all" with {appearance} in `out`. The avatar's own identity poses the
-    mesh. relative: the motion from its neutral, see `relative_clip`; other_identity: another
-    person's track is meant. Raises InputError before anything is written.
+    appearance: a name, or "all" with {appearance} in `out`; format: a name in `frames.FORMATS`, by
+    default as `out` ends. The avatar's own identity poses the mesh. relative: the motion from its
+    neutral, see `relative_clip`; other_identity: another person's track is meant. Raises InputError
+    before anything is written.
     """
     where = device_of(device)
     avatar = Avatar.load(avatar_path)
@@ -126,6 +127,7 @@ def render_track(
     rows = parse_frames(frames, clip)
     settings = RenderSettings.preset(quality)
     check_pattern(out, several=len(rows) > 1, appearances=len(names), depth=depth)
+    kind = format_of(out, format)
     if size is not None and not 1 <= size <= 16384:
         raise InputError(f"--size {size}: from 1 to 16384")
     posed = posed_avatar(avatar, collection, clip, rows)
@@ -151,20 +153,14 @@ def render_track(
                 should_stop=should_stop,
             )
             path = numbered(out.replace("{appearance}", name), int(clip.frame_id[row]))
-            write_picture(path, picture, {"pav:appearance": name, "pav:avatar": str(avatar_path)})
+            metadata = provenance(
+                [Path(avatar_path).name], [name], int(clip.frame_id[row]), quality
+            )
+            write_frame(path, kind, picture.rgba, None, picture.depth, metadata)
             written.append(path)
             if progress:
                 progress(len(written) / total, picture=str(path))
     return written
-
-
-def write_picture(path: Path, picture: Picture, metadata: dict[str, str]) -> None:
-    """PNG: 8 bit, straight sRGB. EXR: scene-linear, premultiplied, with depth in metres."""
-    if path.suffix == ".exr":
-        depth = np.where(np.isfinite(picture.depth), picture.depth, 1e10)
-        write_exr(path, linear_premultiplied(picture.rgba), depth, metadata)
-    else:
-        write_rgba(path, picture.rgba, metadata=metadata)
 
 
 def check_pattern(out: str, *, several: bool, appearances: int, depth: bool = False) -> None:

@@ -22,6 +22,8 @@ from ...cores import threads
 _pool: ThreadPoolExecutor | None = None
 _pool_size = 0
 _here = threading.local()
+_ran: set[Any] = set()  # what has run before
+_first = threading.Lock()
 
 
 @contextlib.contextmanager
@@ -57,13 +59,23 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_forget_pool)
 
 
+@contextlib.contextmanager
+def _busy() -> Iterator[None]:
+    _here.busy = True
+    try:
+        yield
+    finally:
+        _here.busy = False
+
+
 def run_chunks(fn: Callable[..., Any], n: int, chunk: int, *args: Any) -> None:
     """Call `fn(start, stop, *args)` over [0, n) in pieces of `chunk`, on all threads at once.
 
     Pieces go to whichever thread is free, the caller's included, so uneven work balances itself;
     which thread runs which piece is not fixed, so pieces must not depend on one another. The first
     exception is raised here after the others have stopped. A call from within a piece runs in that
-    piece's thread alone: the others have pieces of their own.
+    piece's thread alone: the others have pieces of their own. The very first piece of a function
+    runs before all others: numba aborts the process where two threads bring it the same new type.
     """
     if chunk < 1:
         raise ValueError(f"chunk must be at least 1, not {chunk}")
@@ -73,23 +85,28 @@ def run_chunks(fn: Callable[..., Any], n: int, chunk: int, *args: Any) -> None:
         for start in range(0, n, chunk):
             fn(start, min(start + chunk, n), *args)
         return
-    counter = itertools.count()
+    code = getattr(fn, "__code__", fn)
+    ahead = 0
+    if code not in _ran:
+        with _first, _busy():
+            fn(0, min(chunk, n), *args)
+        _ran.add(code)
+        ahead = 1
+    counter = itertools.count(ahead)
 
     def work() -> None:
-        _here.busy = True
         try:
-            for piece in counter:
-                if piece >= pieces:
-                    return
-                start = piece * chunk
-                fn(start, min(start + chunk, n), *args)
+            with _busy():
+                for piece in counter:
+                    if piece >= pieces:
+                        return
+                    start = piece * chunk
+                    fn(start, min(start + chunk, n), *args)
         except BaseException:
             for _ in range(pieces):  # nothing is left for the others
                 if next(counter) >= pieces:
                     break
             raise
-        finally:
-            _here.busy = False
 
     helpers = [_executor(workers - 1).submit(work) for _ in range(workers - 1)]
     try:
