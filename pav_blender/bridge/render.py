@@ -48,7 +48,7 @@ def draw(
         combined, depth = solid_pictures.compose(
             display, depth, *solids, shot.background, enlarged=shot.enlarged
         )
-        return Pixels(combined, np.minimum(depth, FAR), display)
+        return Pixels(combined, np.minimum(depth, EMPTY_DEPTH), display)
     combined = linear_premultiplied(display)
     if shot.background is not None:
         combined[..., :3] += (1 - combined[..., 3:]) * np.asarray(shot.background, np.float32)
@@ -172,7 +172,7 @@ def _stack(
     """Straight pictures with depths -> one, each pixel's nearer layer over the farther."""
     if not layers:
         shape = region[3] - region[1], region[2] - region[0]
-        return np.zeros((*shape, 4), np.float32), np.full(shape, FAR, np.float32)
+        return np.zeros((*shape, 4), np.float32), np.full(shape, EMPTY_DEPTH, np.float32)
     if len(layers) == 1:
         return layers[0]
     order = np.argsort([depth for _, depth in layers], axis=0, kind="stable")
