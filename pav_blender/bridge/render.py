@@ -16,6 +16,8 @@ from . import avatars
 from .looks import worn
 from .shot import Actor, Shot
 
+_ROUNDING = 1e-6  # metres: moving an armature as a whole moves its mesh by less in itself
+
 
 @dataclass(frozen=True, eq=False)
 class Pixels:
@@ -100,9 +102,8 @@ class Posed:
         avatar = avatars.load(actor.avatar)
         for entry in self._scenes:
             other, scene = entry
-            if scene.avatar is avatar and replace(
-                other, rigid=actor.rigid, scale=actor.scale
-            ).equals(actor):
+            there = replace(other, rigid=actor.rigid, scale=actor.scale)
+            if scene.avatar is avatar and there.equals(actor, _ROUNDING):
                 self._scenes.remove(entry)
                 self._scenes.append(entry)
                 return scene

@@ -35,13 +35,14 @@ class Actor:
     scale: float
     layers: tuple[Layer, ...] = ()
 
-    def equals(self, other: Actor) -> bool:
-        """Whether both would give the same picture."""
+    def equals(self, other: Actor, within: float = 0.0) -> bool:
+        """Whether both would give the same picture; vertices may differ by `within` metres."""
         return (
             (self.avatar, self.appearance, self.expression, self.scale)
             == (other.avatar, other.appearance, other.expression, other.scale)
             and np.array_equal(self.rigid, other.rigid)
-            and np.array_equal(self.vertices, other.vertices)
+            and self.vertices.shape == other.vertices.shape
+            and np.allclose(self.vertices, other.vertices, rtol=0, atol=within)
             and np.array_equal(self.triangles, other.triangles)
             and len(self.layers) == len(other.layers)
             and all(a.equals(b) for a, b in zip(self.layers, other.layers, strict=True))

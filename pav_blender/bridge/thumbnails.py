@@ -10,12 +10,12 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ..core.errors import PavError
+from ..core.errors import InputError, PavError
 from . import avatars, requirements, turns
 
 SIZE = 96  # pixels a side
 _POLL_S = 0.3
-_WIDE, _AWAY = 0.36, 1.2  # metres: what a picture shows, and from where
+_WIDE, _AWAY = 0.34, 1.2  # metres: what a picture shows, and from where
 
 _previews: Any = None
 _asked: set[tuple[Path, int]] = set()  # files as they were when asked for
@@ -47,11 +47,16 @@ def icons(path: Path, names: Sequence[str]) -> list[int]:
 def draw(path: Path, name: str) -> np.ndarray:
     """An appearance from the front, at rest: straight sRGB [SIZE, SIZE, 4] float32, row 0 on top.
     PavError where the file cannot be read."""
+    from ..core.field.avatar import head_of
     from ..core.rendering.cameras import Camera
     from ..core.rendering.render import RenderSettings, render
 
     avatar = avatars.load(path)
-    points, weights = avatar.canonical_vertices, avatar.rigid_weights
+    try:
+        points = head_of(avatar).shaped(avatar.betas)
+    except InputError:  # the head model is not at hand: as it was learned, the mouth open
+        points = avatar.canonical_vertices
+    weights = avatar.rigid_weights
     middle = (points * weights[:, None]).sum(0) / max(float(weights.sum()), 1e-9)
     pose = np.eye(4)
     pose[:3, :3] = np.diag([1.0, -1.0, -1.0])  # looking along -z, y down in the picture
@@ -113,7 +118,9 @@ def _take() -> float | None:
         path, name, picture = _drawn.pop(0)
         key = _key(path, name)
         preview = _previews[key] if key in _previews else _previews.new(key)
-        flat = np.ascontiguousarray(picture[::-1], np.float32).ravel()
+        shown = picture[::-1].copy()
+        shown[..., :3] *= shown[..., 3:]  # icons are premultiplied
+        flat = shown.ravel()
         for kind in ("image", "icon"):
             setattr(preview, f"{kind}_size", (SIZE, SIZE))
             getattr(preview, f"{kind}_pixels_float").foreach_set(flat)

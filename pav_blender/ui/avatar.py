@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import bpy
 
@@ -64,7 +64,6 @@ class PAV_PT_layers(Sidebar, bpy.types.Panel):
     bl_idname = "PAV_PT_layers"
     bl_label = "Layers"
     bl_parent_id = "PAV_PT_avatar"
-    bl_options: ClassVar = {"DEFAULT_CLOSED"}
 
     @classmethod
     def poll(cls, context: Any) -> bool:

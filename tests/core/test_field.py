@@ -161,13 +161,13 @@ def test_extreme_weights_stay_finite():
             assert torch.isfinite(rgb).all()
 
 
-def test_a_blend_of_one_appearance_is_that_appearance():
+def test_an_appearance_alone_is_that_appearance():
     field, samples = make_field(), make_samples()
     alone = dataclasses.replace(samples, appearance=torch.full((40,), 2, dtype=torch.int32))
     mixed = dataclasses.replace(samples, appearance=torch.zeros(40, dtype=torch.int32))
-    blend = field.blend(torch.tensor([0.0, 0.0, 1.0]))
+    third = field.wearing([2])
     with torch.no_grad():
-        for a, b in zip(field(alone), field(mixed, blend), strict=True):
+        for a, b in zip(field(alone), field(mixed, third), strict=True):
             torch.testing.assert_close(a, b)
 
 

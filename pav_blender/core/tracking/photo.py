@@ -81,7 +81,8 @@ def _feature(grey: np.ndarray) -> np.ndarray:
     smooth = gaussian_filter(grey, 1.0)
     mean = uniform_filter(uniform_filter(smooth, _LOCAL), _LOCAL)
     off = smooth - mean
-    deviation = np.sqrt(uniform_filter(uniform_filter(off * off, _LOCAL), _LOCAL))
+    squares = uniform_filter(uniform_filter(off * off, _LOCAL), _LOCAL)
+    deviation = np.sqrt(squares.clip(0))  # running sums may fall below 0
     return np.round(off / (deviation + _QUIET) / _STEP).clip(-127, 127).astype(np.int8)
 
 
