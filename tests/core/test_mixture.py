@@ -12,6 +12,7 @@ from pav_blender.core.errors import InputError
 from pav_blender.core.evaluation.metrics import over, psnr
 from pav_blender.core.field.mixture import EMPTY, SOLID, Mixture, at_samples, mix
 from pav_blender.core.rendering.render import render
+from pav_blender.core.rendering.sequence import parse_appearance
 from pav_blender.core.rendering.wearing import shares_of, wearing_of
 from pav_blender.core.training.frames import camera_of
 
@@ -85,6 +86,20 @@ def test_wrong_weights_are_named(toy_avatar):
     for wrong in (-1.0, np.nan, 0.0):
         with pytest.raises(InputError, match="plain: finite, none negative"):
             shares_of(toy_avatar, {"plain": wrong})
+
+
+def test_blends_on_a_command_line(toy_avatar):
+    assert parse_appearance("bushy", toy_avatar) == "bushy"
+    assert parse_appearance("bushy=0.25,plain=1", toy_avatar) == {"bushy": 0.25, "plain": 1.0}
+    for text, words in (
+        ("bald", "unknown appearance 'bald'"),
+        ("bald=1", "unknown appearance 'bald'"),
+        ("plain=", "write NAME=WEIGHT"),
+        ("plain=1,bushy", "write NAME=WEIGHT"),
+        ("plain=-1,bushy=2", "none negative"),
+    ):
+        with pytest.raises(InputError, match=words):
+            parse_appearance(text, toy_avatar)
 
 
 def test_only_what_is_worn_somewhere_counts(toy_avatar):

@@ -17,6 +17,7 @@ from ..progress import Report
 from .cameras import Camera
 from .frames import format_of, provenance, write_frame
 from .render import RenderSettings, render
+from .wearing import Appearance, shares_of
 
 
 def parse_track(track: str) -> tuple[Collection, Clip]:
@@ -26,6 +27,22 @@ def parse_track(track: str) -> tuple[Collection, Clip]:
         raise InputError(f"track {track!r}: write COLLECTION:CLIP, e.g. out/collection:short")
     collection = read_collection(folder)
     return collection, collection.clip(name)
+
+
+def parse_appearance(text: str, avatar: Avatar) -> Appearance:
+    """A name, or "NAME=WEIGHT,NAME=WEIGHT,..."; InputError for unknown names and wrong weights."""
+    if text in avatar.appearances or "=" not in text:
+        avatar.appearance_index(text)
+        return text
+    weights: dict[str, float] = {}
+    for part in text.split(","):
+        name, _, weight = part.rpartition("=")
+        try:
+            weights[name] = float(weight)
+        except ValueError as error:
+            raise InputError(f"appearance {text!r}: write NAME=WEIGHT,NAME=WEIGHT") from error
+    shares_of(avatar, weights)
+    return weights
 
 
 def parse_frames(text: str | None, clip: Clip) -> np.ndarray:
@@ -107,10 +124,10 @@ def render_track(
 ) -> list[Path]:
     """Renders and writes one picture a frame; returns their paths.
 
-    appearance: a name, or "all" with {appearance} in `out`; format: a name in `frames.FORMATS`, by
-    default as `out` ends. The avatar's own identity poses the mesh. relative: the motion from its
-    neutral, see `relative_clip`; other_identity: another person's track is meant. Raises InputError
-    before anything is written.
+    appearance: a name, a blend (`parse_appearance`), or "all" with {appearance} in `out`; format: a
+    name in `frames.FORMATS`, by default as `out` ends. The avatar's own identity poses the mesh.
+    relative: the motion from its neutral, see `relative_clip`; other_identity: another person's
+    track is meant. Raises InputError before anything is written.
     """
     where = device_of(device)
     avatar = Avatar.load(avatar_path)
@@ -122,8 +139,7 @@ def render_track(
     if relative:
         clip = relative_clip(clip)
     names = avatar.appearances if appearance == "all" else [appearance]
-    for name in names:
-        avatar.appearance_index(name)
+    worn = {name: parse_appearance(name, avatar) for name in names}
     rows = parse_frames(frames, clip)
     settings = RenderSettings.preset(quality)
     check_pattern(out, several=len(rows) > 1, appearances=len(names), depth=depth)
@@ -147,7 +163,7 @@ def render_track(
                 avatar,
                 posed[at],
                 camera,
-                name,
+                worn[name],
                 settings,
                 expression=clip.expression[row],
                 should_stop=should_stop,
