@@ -93,6 +93,8 @@ def test_a_damaged_avatar_ends_with_code_1_and_no_frame(blender, files):
 NEST = """
 import bpy
 inner = bpy.context.scene
+head = next(thing for thing in inner.objects if thing.pav.avatar)
+head.pav.avatar = "//later.pav"
 outer = bpy.data.scenes.new("outer")
 outer.render.resolution_x, outer.render.resolution_y = 48, 40
 outer.camera = inner.camera
@@ -123,7 +125,7 @@ def test_an_error_in_a_nested_scene_ends_with_code_1(blender, files):
     done = blender("-b", nested / "nested.blend", "-a")
     assert done.returncode == 1, done.stdout + done.stderr
     assert frames_in(nested) == []
-    small.write_avatar(ROOT / nested / "small.pav")
+    small.write_avatar(ROOT / files / "later.pav")  # the path follows the file that is saved
     done = blender("-b", nested / "nested.blend", "-a")
     assert done.returncode == 0, done.stdout + done.stderr
     assert frames_in(nested) == ["nested0003.png"]

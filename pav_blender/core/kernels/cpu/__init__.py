@@ -18,7 +18,8 @@ from typing import Any
 
 from .. import MODULES
 
-_KEPT_CACHES = 4
+_KEPT_CACHES = 6
+_CHOSEN = "PAV_NUMBA_CACHE"  # what was chosen here, not by the user: child processes choose anew
 
 
 def _cache_root() -> Path:
@@ -32,8 +33,12 @@ def _cache_root() -> Path:
 
 
 def _fingerprint() -> str:
-    """Hash of the kernels' sources: numba looks at one file's date and misses edits of imports."""
-    digest = hashlib.sha256()
+    """Hash of the kernels' sources: numba looks at one file's date and misses edits of imports.
+
+    And of the package's name: compiled code imports its parts by it, and a Blender extension has
+    another than what runs beside Blender.
+    """
+    digest = hashlib.sha256(__name__.encode())
     for path in sorted(Path(__file__).parents[1].rglob("*.py")):
         digest.update(path.name.encode())
         digest.update(path.read_bytes())
@@ -73,9 +78,10 @@ def _choose_cache() -> str:
 
 
 def _set_cache() -> None:
-    if os.environ.get("NUMBA_CACHE_DIR"):
+    given = os.environ.get("NUMBA_CACHE_DIR")
+    if given and given != os.environ.get(_CHOSEN):
         return
-    os.environ["NUMBA_CACHE_DIR"] = folder = _choose_cache()
+    os.environ["NUMBA_CACHE_DIR"] = os.environ[_CHOSEN] = folder = _choose_cache()
     loaded = sys.modules.get("numba.core.config")
     if loaded is not None and not loaded.CACHE_DIR:  # the host imported numba before us
         setattr(loaded, "CACHE_DIR", folder)  # noqa: B010  (a module's attribute, unknown to mypy)
