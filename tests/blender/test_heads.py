@@ -184,6 +184,7 @@ def test_the_operator_writes_what_the_verb_writes(formula, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.npz", "b.npz"]
 
 
+@pytest.mark.slow
 def test_from_a_blend_to_a_picture(formula_path, small_config, tmp_path, capsys):
     """A head without UVs goes all the way: head file, collection, training, picture."""
     path, directions = formula_path

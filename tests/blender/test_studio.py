@@ -164,6 +164,7 @@ def test_wrong_requests_are_refused(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_the_committed_collection_renders_again():
     """Two frames of the default collection: the parameters but for the last bit, which differs
     between versions of numpy; the pictures closely."""

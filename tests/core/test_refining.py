@@ -275,6 +275,7 @@ def test_where_it_does_not_help_the_track_stays(toy, small_config, tmp_path, mon
         np.testing.assert_array_equal(clip.expression, own.expression)
 
 
+@pytest.mark.slow
 def test_the_same_input_gives_the_same_and_so_does_a_stopped_training(
     toy, small_config, tmp_path, always
 ):

@@ -131,6 +131,7 @@ def test_check_refuses_what_it_cannot_draw(scene, tmp_path, capsys):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_the_same_input_gives_the_same_files(scene, tmp_path):
     video, out, _ = scene
     track([video], tmp_path / "again", size=96)
@@ -227,6 +228,7 @@ def test_a_cache_of_something_else_is_not_used(tmp_path):
     assert key_of("a", 1) != key_of("a", "1") != key_of(np.arange(2), "a")
 
 
+@pytest.mark.slow
 def test_another_setting_looks_again(scene, tmp_path, monkeypatch):
     video, _, _ = scene
     asked = []
