@@ -129,6 +129,7 @@ def test_memory_is_that_of_the_process(tmp_path):
         memory._measured("broken", "1 / 0")
 
 
+@pytest.mark.faces
 def test_mattes_are_measured_against_the_truth(tmp_path, monkeypatch, capsys):
     pytest.importorskip("mediapipe", reason="the optional mediapipe is not installed")
     from pav_blender.benchmarks import matte

@@ -167,6 +167,7 @@ def test_wrong_settings_are_refused(steps, tmp_path):
         track([steps], tmp_path / "there")
 
 
+@pytest.mark.faces
 def test_a_video_without_a_face_is_named_and_nothing_is_written(tmp_path):
     pytest.importorskip("mediapipe", reason="the optional mediapipe is not installed")
     random = np.random.default_rng(0)
@@ -475,6 +476,7 @@ def test_stopping_leaves_nothing_but_what_to_go_on_from(made_up, monkeypatch, wh
     assert not out.exists()
 
 
+@pytest.mark.faces
 @pytest.mark.skipif(not CLIPS.is_dir(), reason=f"no real clips at ../shared/clips ({CLIPS})")
 def test_a_real_clip(tmp_path):
     pytest.importorskip("mediapipe", reason="the optional mediapipe is not installed")

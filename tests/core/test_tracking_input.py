@@ -62,6 +62,7 @@ def scene(tmp_path_factory):
     return video, folder / "out", report
 
 
+@pytest.mark.faces
 def test_shots_reasons_labels_and_landmarks_reach_the_collection(scene):
     _, out, report = scene
     assert [(clip["name"], clip["frames"]) for clip in report.clips] == [
@@ -88,6 +89,7 @@ def test_shots_reasons_labels_and_landmarks_reach_the_collection(scene):
     assert not out.with_name("out.partial").exists()
 
 
+@pytest.mark.faces
 def test_check_shows_the_track(scene, tmp_path, capsys):
     _, out, report = scene
     sheet, plot, video = (tmp_path / name for name in ("sheet.png", "plot.svg", "review.mp4"))
@@ -109,6 +111,7 @@ def test_check_shows_the_track(scene, tmp_path, capsys):
     assert plot.read_text().count("median") == 2
 
 
+@pytest.mark.faces
 def test_a_wrong_track_shows_in_its_error(scene):
     collection = read_collection(scene[1])
     clip = collection.clips[0]
@@ -122,6 +125,7 @@ def test_a_wrong_track_shows_in_its_error(scene):
     assert review.landmark_errors(collection, replace(clip, landmarks=None)) is None
 
 
+@pytest.mark.faces
 def test_check_refuses_what_it_cannot_draw(scene, tmp_path, capsys):
     for option, name in (("--video", "a.avi"), ("--plot", "a.gif")):
         assert main(["check", str(scene[1]), option, str(tmp_path / name)]) == 2
@@ -131,6 +135,7 @@ def test_check_refuses_what_it_cannot_draw(scene, tmp_path, capsys):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.faces
 @pytest.mark.slow
 def test_the_same_input_gives_the_same_files(scene, tmp_path):
     video, out, _ = scene
@@ -138,6 +143,7 @@ def test_the_same_input_gives_the_same_files(scene, tmp_path):
     assert digests(tmp_path / "again") == digests(out)
 
 
+@pytest.mark.faces
 def test_stopped_anywhere_and_going_on_gives_the_same(tmp_path_factory, tmp_path, monkeypatch):
     pictures = [filmed.frame("crop", row) for row in range(10)]
     video = filmed.film(tmp_path_factory.mktemp("video") / "ten.mp4", pictures)
@@ -174,6 +180,7 @@ def test_stopped_anywhere_and_going_on_gives_the_same(tmp_path_factory, tmp_path
     assert not out.with_name("out.partial").exists()
 
 
+@pytest.mark.faces
 @pytest.mark.parametrize(
     "how", [signal.SIGINT, pytest.param(signal.SIGKILL, marks=pytest.mark.slow)]
 )
@@ -228,6 +235,7 @@ def test_a_cache_of_something_else_is_not_used(tmp_path):
     assert key_of("a", 1) != key_of("a", "1") != key_of(np.arange(2), "a")
 
 
+@pytest.mark.faces
 @pytest.mark.slow
 def test_another_setting_looks_again(scene, tmp_path, monkeypatch):
     video, _, _ = scene
@@ -246,6 +254,7 @@ def test_another_setting_looks_again(scene, tmp_path, monkeypatch):
     assert len(read_collection(tmp_path / "out").clips[0]) <= 16
 
 
+@pytest.mark.faces
 def test_a_folder_of_pictures_in_natural_order(tmp_path):
     folder = tmp_path / "Anna's photos"
     folder.mkdir()
@@ -291,6 +300,7 @@ def test_pictures_of_any_kind_read_alike(tmp_path):
         open_source(tmp_path)
 
 
+@pytest.mark.faces
 @pytest.mark.parametrize(
     ("height", "width", "rate", "light"),
     [
@@ -319,6 +329,7 @@ def test_any_size_rate_and_light(tmp_path, height, width, rate, light):
     assert (rgba[face[:, 1], face[:, 0], 3] > 200).mean() > 0.95
 
 
+@pytest.mark.faces
 def test_a_clip_cut_off_gives_what_there_is_and_says_so(tmp_path, capsys):
     pictures = [filmed.frame("crop", row) for row in range(16)]
     whole = filmed.film(tmp_path / "whole.avi", pictures).read_bytes()
@@ -331,6 +342,7 @@ def test_a_clip_cut_off_gives_what_there_is_and_says_so(tmp_path, capsys):
     assert 5 <= len(clip) < 16
 
 
+@pytest.mark.faces
 def test_clips_share_an_appearance_by_name(tmp_path):
     for name in ("may", "june"):
         pictures = [filmed.frame("crop", row) for row in range(3)]
@@ -345,6 +357,7 @@ def test_clips_share_an_appearance_by_name(tmp_path):
     assert not (out / "clips" / "may" / "labels").exists()  # they need the matte
 
 
+@pytest.mark.faces
 def test_of_two_people_the_one_who_comes_back_is_tracked(tmp_path):
     """The other is nearer, and made up: the same person, wider."""
     pictures = []
