@@ -35,7 +35,7 @@ def render_blend(
         from . import avatars
 
         scene = bpy.context.scene
-        heads = [thing for thing in scene.objects if thing.type == "MESH" and thing.pav.avatar]
+        heads = avatars.heads_of(scene.objects)
         if not heads:
             raise InputError(f"{blend}: no object in it wears an avatar; see `pav scene`")
         known = avatars.load(avatars.path_of(heads[0].pav)).appearances

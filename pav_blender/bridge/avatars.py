@@ -6,6 +6,7 @@ import hashlib
 import os
 import zlib
 from collections import OrderedDict
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,7 @@ from ..core.errors import InputError
 
 _KEPT = 4
 _loaded: OrderedDict[tuple[str, int, int], Any] = OrderedDict()
-_headers: dict[str, tuple[tuple[str, int, int], dict[str, Any]]] = {}
-_contents: dict[str, tuple[tuple[str, int, int], str]] = {}
+_facts: dict[tuple[str, str], tuple[tuple[str, int, int], Any]] = {}  # by path and what it is
 
 
 def _identity(path: Path) -> tuple[str, int, int]:
@@ -23,6 +23,11 @@ def _identity(path: Path) -> tuple[str, int, int]:
     except OSError as error:
         raise InputError(f"{path}: no such avatar file") from error
     return str(path), status.st_mtime_ns, status.st_size
+
+
+def heads_of(objects: Iterable[Any]) -> list[Any]:
+    """The mesh objects among `objects` that wear an avatar."""
+    return [thing for thing in objects if thing.type == "MESH" and thing.pav.avatar]
 
 
 def resolve(stored: str, library: Any | None = None) -> Path:
@@ -105,33 +110,36 @@ def header(path: Path) -> dict[str, Any]:
     """The header of an avatar file, cached. InputError, one line."""
     from ..core.field.avatar import read_header
 
-    key = _identity(path)
-    known = _headers.get(str(path))
-    if known is None or known[0] != key:
-        _headers[str(path)] = known = (key, read_header(path))
-    return known[1]
+    return _known("header", path, read_header)
 
 
 def content(path: Path) -> str:
     """A hash of an avatar file, the same wherever it lies; read again only when it changed.
     InputError, one line."""
-    key = _identity(path)
-    known = _contents.get(str(path))
-    if known is None or known[0] != key:
-        try:
-            with path.open("rb") as stream:
-                found = hashlib.file_digest(stream, "sha256").hexdigest()
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-        _contents[str(path)] = known = (key, found)
+    return _known("content", path, _hash)
+
+
+def _hash(path: Path) -> str:
+    try:
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+
+
+def _known(what: str, path: Path, read: Callable[[Path], Any]) -> Any:
+    """What `read` says of a file, asked again only when the file changed."""
+    identity = _identity(path)
+    known = _facts.get((what, str(path)))
+    if known is None or known[0] != identity:
+        _facts[what, str(path)] = known = (identity, read(path))
     return known[1]
 
 
 def forget() -> None:
     """Drops every loaded model."""
     _loaded.clear()
-    _headers.clear()
-    _contents.clear()
+    _facts.clear()
 
 
 def number(name: str) -> int:

@@ -13,6 +13,7 @@ import bpy
 
 from ..core.errors import InputError
 from ..core.rendering.frames import EMPTY_DEPTH
+from .avatars import heads_of
 from .scene import ENGINE
 
 HEADS, JOIN = "PAV Heads", "PAV Join by Depth"
@@ -31,7 +32,7 @@ def composite(scene: Any, engine: str) -> Any:
             f"scene {scene.name!r} renders the heads of {scene.pav.frames.shown_in.name!r}; "
             "switch to that one"
         )
-    heads = heads_of(scene)
+    heads = heads_of(scene.objects)
     if not heads:
         raise InputError(f"scene {scene.name!r} has no head with an avatar")
     for head in heads:
@@ -71,14 +72,10 @@ def separate(scene: Any) -> None:
         tree.nodes.remove(join)
     if tree is not None and heads is not None:
         tree.nodes.remove(heads)
-    for head in heads_of(scene):
+    for head in heads_of(scene.objects):
         head.visible_camera = True
     if inner is not None:
         bpy.data.scenes.remove(inner)
-
-
-def heads_of(scene: Any) -> list[Any]:
-    return [thing for thing in scene.objects if thing.type == "MESH" and thing.pav.avatar]
 
 
 def head_scene(scene: Any) -> Any | None:

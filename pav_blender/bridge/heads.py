@@ -16,6 +16,7 @@ import numpy as np
 from ..core.errors import InputError
 from ..core.head import HeadModel, head_from_shape_keys
 from .axes import TO_CORE
+from .mesh import group_weights
 from .pose_keys import pose_keys
 from .rig import CORRECTIVE_PREFIX, REGION_PREFIX, find_armature
 
@@ -162,7 +163,7 @@ def _positions(object_: Any) -> tuple[np.ndarray, dict[str, np.ndarray]]:
             continue
         offset = _coordinates(key.data) - _coordinates(key.relative_key.data)
         if key.vertex_group:
-            offset *= _weights(object_)[:, object_.vertex_groups[key.vertex_group].index, None]
+            offset *= group_weights(object_)[:, object_.vertex_groups[key.vertex_group].index, None]
         offsets[key.name] = offset
     return _coordinates(keys.reference_key.data), offsets
 
@@ -171,15 +172,6 @@ def _coordinates(points: Any) -> np.ndarray:
     flat = np.empty(3 * len(points), np.float32)
     points.foreach_get("co", flat)
     return flat.reshape(-1, 3).astype(np.float64)
-
-
-def _weights(object_: Any) -> np.ndarray:
-    """Weights [V, groups] of all vertex groups."""
-    weights = np.zeros((len(object_.data.vertices), max(1, len(object_.vertex_groups))))
-    for vertex in object_.data.vertices:
-        for element in vertex.groups:
-            weights[vertex.index, element.group] = element.weight
-    return weights
 
 
 def _joints(
@@ -196,7 +188,7 @@ def _joints(
     for ours, theirs in renamed.items():
         if theirs not in bones:
             raise InputError(f"armature {armature.name!r} has no bone {theirs!r} (for {ours!r})")
-    every = _weights(object_)
+    every = group_weights(object_)
     groups = {group.name: group.index for group in object_.vertex_groups}
     kept = [
         bone
@@ -253,7 +245,7 @@ def _regions(object_: Any, renamed: dict[str, str]) -> dict[str, np.ndarray]:
             raise InputError(
                 f"object {object_.name!r} has no vertex group {theirs!r} (for {ours!r})"
             )
-    weights = _weights(object_) if wanted else None
+    weights = group_weights(object_) if wanted else None
     return {
         ours: weights[:, groups[theirs]] >= _MEMBER  # type: ignore[index]
         for ours, theirs in wanted.items()

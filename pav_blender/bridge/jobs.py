@@ -15,6 +15,7 @@ from typing import Protocol
 import bpy
 
 from ..core.errors import PavError
+from .windows import redraw
 
 TRAINING, WRITING = "Training", "Writing frames"
 INSTALLING, CHECKING = "Installing", "Checking"
@@ -100,17 +101,10 @@ def _tick() -> float | None:
         return None
     if job.running and job.work.step():
         job.running = False
-        _redraw()
+        redraw("PREFERENCES", "PROPERTIES", "VIEW_3D")
         return None
-    _redraw()
+    redraw("PREFERENCES", "PROPERTIES", "VIEW_3D")
     return _INTERVAL_S
-
-
-def _redraw() -> None:
-    for window in bpy.context.window_manager.windows:
-        for area in window.screen.areas:
-            if area.type in {"VIEW_3D", "PROPERTIES", "PREFERENCES"}:
-                area.tag_redraw()
 
 
 def register() -> None:

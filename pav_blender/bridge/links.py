@@ -3,7 +3,6 @@ another, and when a file was moved."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ import bpy
 
 from ..core.errors import InputError, PavError
 from . import avatars
-from .avatars import stored_path
+from .avatars import heads_of, stored_path
 
 _before: list[tuple[str, str]] = []  # objects and their paths, while a copy is saved
 
@@ -24,7 +23,7 @@ def relink(folder: Path) -> tuple[list[str], list[str]]:
         raise InputError(f"{folder}: no such folder")
     files = sorted(path for path in folder.rglob("*.pav") if path.is_file())
     mended, missing = [], []
-    for object_ in _heads():
+    for object_ in heads_of(bpy.data.objects):
         if not _missing(object_):
             continue
         found = None if object_.library else _find(object_, files)
@@ -35,10 +34,6 @@ def relink(folder: Path) -> tuple[list[str], list[str]]:
             where = f" (linked from {object_.library.filepath})" if object_.library else ""
             missing.append(f"{object_.name}: {object_.pav.avatar}{where}")
     return mended, missing
-
-
-def _heads() -> Iterator[Any]:
-    return (object_ for object_ in bpy.data.objects if object_.pav.avatar)
 
 
 def _missing(object_: Any) -> bool:
@@ -80,7 +75,7 @@ def _before_saving(*arguments: Any) -> None:
     if not target:
         return
     folder = Path(target).resolve().parent
-    for object_ in _heads():
+    for object_ in heads_of(bpy.data.objects):
         if object_.library is not None or not avatars.own_path(object_.pav):
             continue
         stored = object_.pav.avatar

@@ -50,6 +50,7 @@ def worn(base: str, layers: tuple[Layer, ...]) -> str | dict[str, np.ndarray]:
 def read_layers(evaluated: Any) -> tuple[Layer, ...]:
     """The layers of an evaluated head that show anything. InputError for a wrong choice."""
     original = evaluated.original
+    every: np.ndarray | None = None
     found = []
     for index, layer in enumerate(evaluated.pav.layers):
         if layer.weight <= 0:
@@ -67,7 +68,8 @@ def read_layers(evaluated: Any) -> tuple[Layer, ...]:
                     f"object {original.name!r}: layer {index + 1} is for the vertex group "
                     f"{layer.region!r}, which is not there"
                 )
-            mask = mesh.group_weights(original, group.index)
+            every = mesh.group_weights(original) if every is None else every
+            mask = np.ascontiguousarray(every[:, group.index])
             if not mask.any():
                 continue
         found.append(Layer(layer.appearance, float(layer.weight), mask))
@@ -87,8 +89,9 @@ def add_area(object_: Any, name: str) -> str:
     points = keys.reference_key.data if keys else object_.data.vertices
     flat = np.empty(3 * len(points), np.float32)
     points.foreach_get("co", flat)
+    every = mesh.group_weights(object_)
     regions = {
-        group.name.removeprefix(REGION_PREFIX): mesh.group_weights(object_, group.index) > 0.5
+        group.name.removeprefix(REGION_PREFIX): every[:, group.index] > 0.5
         for group in object_.vertex_groups
         if group.name.startswith(REGION_PREFIX)
     }

@@ -33,13 +33,12 @@ def evaluated_vertices(evaluated: Any) -> np.ndarray:
     return vertices(evaluated.data)
 
 
-def group_weights(object_: Any, index: int) -> np.ndarray:
-    """Weights [V] float32 of one vertex group of a mesh object."""
-    weights = np.zeros(len(object_.data.vertices), np.float32)
+def group_weights(object_: Any) -> np.ndarray:
+    """Weights [V, groups] float32 of all vertex groups of a mesh object; one column at least."""
+    weights = np.zeros((len(object_.data.vertices), max(1, len(object_.vertex_groups))), np.float32)
     for vertex in object_.data.vertices:
         for member in vertex.groups:
-            if member.group == index:
-                weights[vertex.index] = member.weight
+            weights[vertex.index, member.group] = member.weight
     return weights
 
 

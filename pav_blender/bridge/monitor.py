@@ -13,6 +13,7 @@ import numpy as np
 from ..core.errors import PavError
 from ..core.training.places import PICTURE
 from .training import Watch
+from .windows import show_as_icon
 
 SIDE = 192  # pixels of the curve's picture: icons are square
 _FINER = 3
@@ -49,12 +50,7 @@ class _Shelf:
         for picture in pictures:
             self._made += 1
             preview = self._previews.new(f"pav{self._made}")
-            preview.image_size = picture.shape[1], picture.shape[0]
-            flipped = np.ascontiguousarray(picture[::-1], np.float32)
-            preview.image_pixels_float.foreach_set(flipped.ravel())
-            if max(picture.shape) <= _SMALL:  # beside text Blender shows the other of the two
-                preview.icon_size = picture.shape[1], picture.shape[0]
-                preview.icon_pixels_float.foreach_set(flipped.ravel())
+            show_as_icon(preview, picture, small=max(picture.shape) <= _SMALL)
             self.icons.append(preview.icon_id)
         for name in old:
             del self._previews[name]

@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 from ..core.errors import InputError
+from .avatars import heads_of
 
 
 def override_head(context: Any, object_: Any) -> Any:
@@ -18,7 +19,7 @@ def override_head(context: Any, object_: Any) -> Any:
 
     shown = object_.instance_collection
     linked = shown if shown is not None and shown.library else object_
-    if linked.library is None and not any(_is_linked(head) for head in _heads([object_])):
+    if linked.library is None and not any(_is_linked(head) for head in heads_of([object_])):
         raise InputError(f"object {object_.name!r} is not linked from another file")
     if linked.library is not None:
         before = set(bpy.data.objects)
@@ -27,11 +28,11 @@ def override_head(context: Any, object_: Any) -> Any:
         )
         if made is None:
             raise InputError(f"Blender could not override {linked.name!r}")
-        heads = _heads(set(bpy.data.objects) - before)
+        heads = heads_of(set(bpy.data.objects) - before)
         if linked == shown and heads:
             bpy.data.objects.remove(object_)
     else:
-        heads = _heads([object_])
+        heads = heads_of([object_])
     if not heads:
         raise InputError(f"{linked.name!r} holds no head with an avatar")
     for head in heads:
@@ -50,7 +51,3 @@ def check_editable(mesh: Any, armature: Any | None) -> None:
 
 def _is_linked(mesh: Any) -> bool:
     return mesh.library is not None or mesh.data.library is not None
-
-
-def _heads(objects: Any) -> list[Any]:
-    return [thing for thing in objects if thing.type == "MESH" and thing.pav.avatar]

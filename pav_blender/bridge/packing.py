@@ -7,12 +7,12 @@ saving carry it along, and undo, which copies only what changed, leaves it alone
 from __future__ import annotations
 
 import hashlib
-import os
 import re
 from pathlib import Path
 from typing import Any
 
 from ..core.errors import InputError
+from ..core.files import replacing
 
 _BYTES, _HASH, _NAME = "pav_bytes", "pav_sha256", "pav_name"
 _LARGEST = 1 << 30  # Blender holds a property's length in 32 bits
@@ -57,10 +57,8 @@ def unpacked(text: Any) -> Path:
     data = bytes(text[_BYTES])
     if hashlib.sha256(data).hexdigest() != digest:
         raise InputError(f"the avatar packed in the text {text.name!r} is damaged")
-    folder.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{os.getpid()}.partial")
-    temporary.write_bytes(data)
-    os.replace(temporary, path)
+    with replacing(path) as temporary:
+        temporary.write_bytes(data)
     return path
 
 
@@ -80,9 +78,8 @@ def unpack(mesh: Any) -> Path:
     if path.exists() and path.read_bytes() != data:
         raise InputError(f"{path}: another file is there already; move it away first")
     if not path.exists():
-        temporary = path.with_name(f".{path.name}.partial-{os.getpid()}")
-        temporary.write_bytes(data)
-        os.replace(temporary, path)
+        with replacing(path) as temporary:
+            temporary.write_bytes(data)
     for object_ in bpy.data.objects:
         if object_.library is None and object_.pav.pack.text == text:
             object_.pav.avatar = f"//{path.name}"

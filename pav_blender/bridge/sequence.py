@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -208,10 +207,3 @@ def display(shot: Shot, pixels: Pixels) -> np.ndarray:
 def _line(error: Exception, frame: int) -> str:
     name = "" if isinstance(error, PavError) else f"{type(error).__name__}: "
     return f"frame {frame}: {name}{error}"
-
-
-def blocking(sequence: Sequence, report: Callable[[str], None]) -> None:
-    """Runs a sequence to its end."""
-    while not sequence.step():
-        sequence.wait()
-        report(sequence.message)

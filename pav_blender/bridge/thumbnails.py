@@ -12,6 +12,7 @@ import numpy as np
 
 from ..core.errors import InputError, PavError
 from . import avatars, requirements, turns
+from .windows import redraw, show_as_icon
 
 SIZE = 96  # pixels a side
 _POLL_S = 0.3
@@ -29,13 +30,13 @@ def icons(path: Path, names: Sequence[str]) -> list[int]:
     beside everything else; none are without a window."""
     nothing = [0] * len(names)
     ours = threading.current_thread() is threading.main_thread()  # a render asks from its own
-    if bpy.app.background or not ours or requirements.missing():
+    if bpy.app.background or not ours:
         return nothing
     try:
         identity = path, path.stat().st_mtime_ns
     except OSError:
         return nothing
-    if identity not in _asked:
+    if identity not in _asked and not requirements.missing():
         _asked.add(identity)
         _ask(path, names)
     if _previews is None:
@@ -118,17 +119,9 @@ def _take() -> float | None:
         path, name, picture = _drawn.pop(0)
         key = _key(path, name)
         preview = _previews[key] if key in _previews else _previews.new(key)
-        shown = picture[::-1].copy()
-        shown[..., :3] *= shown[..., 3:]  # icons are premultiplied
-        flat = shown.ravel()
-        for kind in ("image", "icon"):
-            setattr(preview, f"{kind}_size", (SIZE, SIZE))
-            getattr(preview, f"{kind}_pixels_float").foreach_set(flat)
+        show_as_icon(preview, picture)
     if fresh:
-        for window in bpy.context.window_manager.windows:
-            for area in window.screen.areas:
-                if area.type == "VIEW_3D":
-                    area.tag_redraw()
+        redraw("VIEW_3D")
     return None if over else _POLL_S
 
 

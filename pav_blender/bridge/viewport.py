@@ -25,6 +25,7 @@ from .render import Pixels, Posed, draw
 from .shot import Actor, Shot, film_background, find_actors
 from .sight import view_border, view_camera
 from .solids import Copies
+from .windows import redraw
 
 _COARSE_S = 0.06  # what the first picture of a new view may take, while the user waits for it
 _CHUNK = 2048
@@ -309,10 +310,7 @@ def _work() -> None:
 def _poll() -> float:
     if _finished.is_set():
         _finished.clear()
-        for window in bpy.context.window_manager.windows:
-            for area in window.screen.areas:
-                if area.type == "VIEW_3D":
-                    area.tag_redraw()
+        redraw("VIEW_3D")
     return _POLL_S
 
 

@@ -9,5 +9,9 @@ class InputError(PavError):
     """Wrong input from the user (a file, a name, a value). Exit code 2."""
 
 
+class OtherPerson(InputError):
+    """A track of another person than the avatar's, which may be meant."""
+
+
 class Cancelled(PavError):
     """The user stopped the work; nothing is written under the final name."""

@@ -10,11 +10,11 @@ import numpy as np
 
 from ..bridge import requirements
 from ..bridge import scene as bridge_scene
-from .context import object_mode, select
+from .context import ChoosesFile, object_mode, select
 from .reporting import reporting
 
 
-class PAV_OT_add_head(bpy.types.Operator):
+class PAV_OT_add_head(ChoosesFile, bpy.types.Operator):
     """Add the head of an avatar file, with its rig"""
 
     bl_idname = "pav.add_head"
@@ -25,10 +25,6 @@ class PAV_OT_add_head(bpy.types.Operator):
     filter_glob: bpy.props.StringProperty(  # type: ignore[valid-type]
         default="*.pav", options={"HIDDEN"}
     )
-
-    def invoke(self, context: Any, _event: Any) -> set[str]:
-        context.window_manager.fileselect_add(self)
-        return {"RUNNING_MODAL"}
 
     @reporting
     def execute(self, context: Any) -> set[str]:
@@ -67,7 +63,7 @@ class PAV_OT_add_rig(bpy.types.Operator):
         return {"FINISHED"}
 
 
-class PAV_OT_save_head(bpy.types.Operator):
+class PAV_OT_save_head(ChoosesFile, bpy.types.Operator):
     """Write the active mesh, its shape keys and its armature as a head file"""
 
     bl_idname = "pav.save_head"
@@ -82,10 +78,9 @@ class PAV_OT_save_head(bpy.types.Operator):
     def poll(cls, context: Any) -> bool:
         return context.active_object is not None and context.active_object.type == "MESH"
 
-    def invoke(self, context: Any, _event: Any) -> set[str]:
+    def invoke(self, context: Any, event: Any) -> set[str]:
         self.filepath = f"{context.active_object.name}.npz"
-        context.window_manager.fileselect_add(self)
-        return {"RUNNING_MODAL"}
+        return super().invoke(context, event)
 
     @reporting
     def execute(self, context: Any) -> set[str]:

@@ -6,7 +6,32 @@ from typing import Any
 
 import bpy
 
+from ..bridge import jobs
 from ..core.errors import InputError
+
+
+class OfHead:
+    """An operator that needs a head."""
+
+    @classmethod
+    def poll(cls, context: Any) -> bool:
+        return find_head(context) is not None
+
+
+class StartsJob:
+    """An operator that starts a job, of which there is one at a time."""
+
+    @classmethod
+    def poll(cls, _context: Any) -> bool:
+        return not jobs.running()
+
+
+class ChoosesFile:
+    """An operator that opens the file browser before it works."""
+
+    def invoke(self, context: Any, _event: Any) -> set[str]:
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
 
 
 def find_head(context: Any) -> Any | None:

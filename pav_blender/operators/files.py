@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import bpy
 
 from ..bridge import avatars, links, overrides, packing, requirements
-from .context import find_head, object_mode, select
+from .context import ChoosesFile, chosen_head, find_head, object_mode, select
 from .reporting import reporting
 
 
@@ -27,7 +27,7 @@ class PAV_OT_pack_avatar(bpy.types.Operator):
     @reporting
     def execute(self, context: Any) -> set[str]:
         requirements.check()
-        head: Any = find_head(context)
+        head = chosen_head(context)
         path = avatars.path_of(head.pav)
         avatars.header(path)  # what is no avatar is not packed
         packing.pack(head, path)
@@ -49,12 +49,12 @@ class PAV_OT_unpack_avatar(bpy.types.Operator):
 
     @reporting
     def execute(self, context: Any) -> set[str]:
-        path = packing.unpack(find_head(context))
+        path = packing.unpack(chosen_head(context))
         self.report({"INFO"}, f"Wrote {path}")
         return {"FINISHED"}
 
 
-class PAV_OT_relink_avatars(bpy.types.Operator):
+class PAV_OT_relink_avatars(ChoosesFile, bpy.types.Operator):
     """Find the avatar files that are missing, in a folder and those below it"""
 
     bl_idname = "pav.relink_avatars"
@@ -62,10 +62,6 @@ class PAV_OT_relink_avatars(bpy.types.Operator):
     bl_options: ClassVar = {"REGISTER", "UNDO"}
 
     directory: bpy.props.StringProperty(subtype="DIR_PATH")  # type: ignore[valid-type]
-
-    def invoke(self, context: Any, _event: Any) -> set[str]:
-        context.window_manager.fileselect_add(self)
-        return {"RUNNING_MODAL"}
 
     @reporting
     def execute(self, context: Any) -> set[str]:

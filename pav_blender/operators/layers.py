@@ -8,18 +8,11 @@ import bpy
 
 from ..bridge import looks
 from ..core.errors import InputError
-from .context import chosen_head, find_head
+from .context import OfHead, chosen_head
 from .reporting import reporting
 
 
-class _OfHead:
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        head = find_head(context)
-        return head is not None and bool(head.pav.avatar)
-
-
-class PAV_OT_add_layer(_OfHead, bpy.types.Operator):
+class PAV_OT_add_layer(OfHead, bpy.types.Operator):
     """Wear another appearance over the head's own"""
 
     bl_idname = "pav.add_layer"
@@ -50,7 +43,7 @@ class PAV_OT_add_layer(_OfHead, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class PAV_OT_remove_layer(_OfHead, bpy.types.Operator):
+class PAV_OT_remove_layer(OfHead, bpy.types.Operator):
     """Take the chosen layer off; its vertex group stays"""
 
     bl_idname = "pav.remove_layer"
@@ -67,7 +60,7 @@ class PAV_OT_remove_layer(_OfHead, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class PAV_OT_move_layer(_OfHead, bpy.types.Operator):
+class PAV_OT_move_layer(OfHead, bpy.types.Operator):
     """Move the chosen layer; what is lower in the list lies on top"""
 
     bl_idname = "pav.move_layer"
@@ -88,7 +81,7 @@ class PAV_OT_move_layer(_OfHead, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class PAV_OT_paint_region(_OfHead, bpy.types.Operator):
+class PAV_OT_paint_region(OfHead, bpy.types.Operator):
     """Paint the weights that say where the chosen layer shows"""
 
     bl_idname = "pav.paint_region"

@@ -10,12 +10,12 @@ import bpy
 
 from ..bridge import avatars, requirements
 from ..bridge import scene as bridge_scene
-from ..core.errors import InputError, PavError
-from .context import find_head, object_mode
+from ..core.errors import InputError, OtherPerson, PavError
+from .context import ChoosesFile, OfHead, chosen_head, object_mode
 from .reporting import reporting
 
 
-class PAV_OT_import_track(bpy.types.Operator):
+class PAV_OT_import_track(OfHead, bpy.types.Operator):
     """Animate the active head, and the camera, as in a clip of a collection"""
 
     bl_idname = "pav.import_track"
@@ -39,20 +39,16 @@ class PAV_OT_import_track(bpy.types.Operator):
         options={"SKIP_SAVE"},
     )
 
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        return find_head(context) is not None
-
     def invoke(self, context: Any, _event: Any) -> set[str]:
         try:
             requirements.check()
             collection, _ = _chosen(context)
-            bridge_scene.check_person(find_head(context), collection)
-        except PavError as error:
-            self.warning = str(error)
-            if "another person" in self.warning:
-                self.relative = True
-                return context.window_manager.invoke_props_dialog(self, width=500)
+            bridge_scene.check_person(chosen_head(context), collection)
+        except OtherPerson as error:
+            self.warning, self.relative = str(error), True
+            return context.window_manager.invoke_props_dialog(self, width=500)
+        except PavError:
+            pass  # `execute` reports it
         return self.execute(context)
 
     def draw(self, _context: Any) -> None:
@@ -68,7 +64,7 @@ class PAV_OT_import_track(bpy.types.Operator):
         requirements.check()
         object_mode(context)
         collection, clip = _chosen(context)
-        head = find_head(context)
+        head = chosen_head(context)
         if not self.confirm_identity:
             bridge_scene.check_person(head, collection)
         neutral = self.neutral if self.neutral >= 0 else None
@@ -89,7 +85,7 @@ def _chosen(context: Any) -> tuple[Any, str]:
     return collection, settings.clip or collection.clips[0].name
 
 
-class PAV_OT_import_livelink(bpy.types.Operator):
+class PAV_OT_import_livelink(OfHead, ChoosesFile, bpy.types.Operator):
     """Animate the active head as the app Live Link Face recorded it (CSV)"""
 
     bl_idname = "pav.import_livelink"
@@ -112,14 +108,6 @@ class PAV_OT_import_livelink(bpy.types.Operator):
         name="Turn the Head", description="The head's rotation turns the neck", default=True
     )
 
-    @classmethod
-    def poll(cls, context: Any) -> bool:
-        return find_head(context) is not None
-
-    def invoke(self, context: Any, _event: Any) -> set[str]:
-        context.window_manager.fileselect_add(self)
-        return {"RUNNING_MODAL"}
-
     @reporting
     def execute(self, context: Any) -> set[str]:
         requirements.check()
@@ -127,7 +115,7 @@ class PAV_OT_import_livelink(bpy.types.Operator):
 
         object_mode(context)
         done = livelink.import_take(
-            find_head(context),
+            chosen_head(context),
             Path(bpy.path.abspath(self.filepath)),
             start=self.start,
             timecode_rate=self.timecode_rate,

@@ -8,18 +8,15 @@ from typing import Any
 import bpy
 
 from ..bridge import jobs, sequence
+from .context import StartsJob
 from .reporting import reporting
 
 
-class PAV_OT_write_sequence(bpy.types.Operator):
+class PAV_OT_write_sequence(StartsJob, bpy.types.Operator):
     """Write the scene's frames into the output folder; keep those whose inputs did not change"""
 
     bl_idname = "pav.write_sequence"
     bl_label = "Write Frames"
-
-    @classmethod
-    def poll(cls, _context: Any) -> bool:
-        return not jobs.running()
 
     @reporting
     def execute(self, context: Any) -> set[str]:

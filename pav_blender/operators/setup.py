@@ -8,6 +8,7 @@ import bpy
 
 from ..bridge import environment, install, jobs, packages
 from ..core.errors import PavError
+from .context import StartsJob
 from .reporting import reporting
 
 BUILDS = (
@@ -16,7 +17,7 @@ BUILDS = (
 )
 
 
-class PAV_OT_install_torch(bpy.types.Operator):
+class PAV_OT_install_torch(StartsJob, bpy.types.Operator):
     """Install PyTorch, and what else is missing, into the add-on's own folder"""
 
     bl_idname = "pav.install_torch"
@@ -28,10 +29,6 @@ class PAV_OT_install_torch(bpy.types.Operator):
         description="Also PyAV and MediaPipe, which training from videos needs",
         default=True,
     )
-
-    @classmethod
-    def poll(cls, _context: Any) -> bool:
-        return not jobs.running()
 
     def invoke(self, context: Any, _event: Any) -> set[str]:
         if not bpy.app.online_access:
@@ -86,15 +83,11 @@ class PAV_OT_remove_packages(bpy.types.Operator):
         return {"FINISHED"}
 
 
-class PAV_OT_check_environment(bpy.types.Operator):
+class PAV_OT_check_environment(StartsJob, bpy.types.Operator):
     """Look at packages and devices in the Python that training runs in"""
 
     bl_idname = "pav.check_environment"
     bl_label = "Check Environment"
-
-    @classmethod
-    def poll(cls, _context: Any) -> bool:
-        return not jobs.running()
 
     @reporting
     def execute(self, _context: Any) -> set[str]:

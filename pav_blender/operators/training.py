@@ -9,6 +9,7 @@ import bpy
 
 from ..bridge import jobs, training
 from ..bridge.training_properties import output_of, wanted_of
+from .context import ChoosesFile, StartsJob
 from .reporting import reporting
 
 
@@ -21,15 +22,11 @@ def _start(wanted: training.Wanted, resume: bool) -> set[str]:
     return {"FINISHED"}
 
 
-class PAV_OT_train(bpy.types.Operator):
+class PAV_OT_train(StartsJob, bpy.types.Operator):
     """Train an avatar from the videos or the collection, in a process beside Blender"""
 
     bl_idname = "pav.train"
     bl_label = "Train"
-
-    @classmethod
-    def poll(cls, _context: Any) -> bool:
-        return not jobs.running()
 
     @reporting
     def execute(self, context: Any) -> set[str]:
@@ -76,7 +73,7 @@ class PAV_OT_discard_training(bpy.types.Operator):
         return {"FINISHED"}
 
 
-class PAV_OT_add_clips(bpy.types.Operator):
+class PAV_OT_add_clips(ChoosesFile, bpy.types.Operator):
     """Add videos of the person; their appearances are named as their files are"""
 
     bl_idname = "pav.add_clips"
@@ -93,10 +90,6 @@ class PAV_OT_add_clips(bpy.types.Operator):
     filter_movie: bpy.props.BoolProperty(  # type: ignore[valid-type]
         default=True, options={"HIDDEN"}
     )
-
-    def invoke(self, context: Any, _event: Any) -> set[str]:
-        context.window_manager.fileselect_add(self)
-        return {"RUNNING_MODAL"}
 
     @reporting
     def execute(self, context: Any) -> set[str]:

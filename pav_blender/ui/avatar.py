@@ -67,8 +67,7 @@ class PAV_PT_layers(Sidebar, bpy.types.Panel):
 
     @classmethod
     def poll(cls, context: Any) -> bool:
-        head = find_head(context)
-        return head is not None and bool(head.pav.avatar)
+        return find_head(context) is not None
 
     def draw(self, context: Any) -> None:
         head: Any = find_head(context)

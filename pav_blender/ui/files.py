@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import bpy
 
@@ -14,7 +14,7 @@ class PAV_PT_files(Sidebar, bpy.types.Panel):
     bl_idname = "PAV_PT_files"
     bl_label = "Files"
     bl_parent_id = "PAV_PT_avatar"
-    bl_options = {"DEFAULT_CLOSED"}  # noqa: RUF012
+    bl_options: ClassVar = {"DEFAULT_CLOSED"}
 
     def draw(self, context: Any) -> None:
         column = self.layout.column()

@@ -5,6 +5,10 @@ from __future__ import annotations
 import argparse
 import re
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ..core.frame_files import FrameFiles
 
 SUMMARY = "Find empty, torn and missing frames in folders of pictures, and clear them for a resume."
 EXAMPLE = "pav frames out/frames --range 1-250 --repair"
@@ -38,10 +42,9 @@ def run(args: argparse.Namespace) -> int:
     return 1 if wrong else 0
 
 
-def _say(found: object, repair: bool) -> None:
-    from ..core.frame_files import FrameFiles, ranges
+def _say(found: FrameFiles, repair: bool) -> None:
+    from ..core.frame_files import ranges
 
-    assert isinstance(found, FrameFiles)
     done = "removed" if repair else "damaged"
     for path, problem in found.damaged.items():
         print(f"{done}: {path} ({problem})")

@@ -53,3 +53,21 @@ def scene(registered):
 
     bpy.ops.wm.read_homefile(use_factory_startup=True, use_empty=True)
     return bpy.context.scene
+
+
+@pytest.fixture(scope="module")
+def files(registered, tmp_path_factory):
+    """A folder with the avatar small.pav and the collection "collection"."""
+    import small
+
+    folder = tmp_path_factory.mktemp("files")
+    small.write_avatar(folder / "small.pav")
+    small.write_collection(folder / "collection")
+    return folder
+
+
+@pytest.fixture
+def here(files, tmp_path):
+    """A folder with an avatar of its own."""
+    shutil.copy(files / "small.pav", tmp_path / "small.pav")
+    return tmp_path

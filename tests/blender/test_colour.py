@@ -8,20 +8,11 @@ import pytest
 pytest.importorskip("bpy")
 
 import bpy
-import small
 
 from pav_blender.bridge import render, sequence, view
 from pav_blender.bridge import scene as bridge_scene
 from pav_blender.core import images
 from pav_blender.core.collection import read_collection
-
-
-@pytest.fixture(scope="module")
-def files(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("files")
-    small.write_avatar(folder / "small.pav")
-    small.write_collection(folder / "collection")
-    return folder
 
 
 @pytest.fixture

@@ -8,7 +8,6 @@ import pytest
 pytest.importorskip("bpy")
 
 import bpy
-import small
 
 from pav_blender.bridge import compositing, final, render, sequence, shot
 from pav_blender.bridge import scene as bridge_scene
@@ -17,14 +16,6 @@ from pav_blender.core.collection import read_collection
 from pav_blender.core.errors import InputError
 
 RED, GREEN = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
-
-
-@pytest.fixture(scope="module")
-def files(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("files")
-    small.write_avatar(folder / "small.pav")
-    small.write_collection(folder / "collection")
-    return folder
 
 
 @pytest.fixture

@@ -18,14 +18,6 @@ from pav_blender.core.rendering.cameras import Camera
 from pav_blender.core.rendering.render import RenderSettings, render
 
 
-@pytest.fixture(scope="module")
-def files(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("files")
-    small.write_avatar(folder / "small.pav")
-    small.write_collection(folder / "collection")
-    return folder
-
-
 @pytest.fixture
 def made(scene, files):
     """The scene of the clip "walk"; renders quickly."""

@@ -25,21 +25,6 @@ from pav_blender.core.errors import InputError
 ROOT = Path(__file__).resolve().parents[2]
 
 
-@pytest.fixture(scope="module")
-def files(registered, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("files")
-    small.write_avatar(folder / "small.pav")
-    small.write_collection(folder / "collection")
-    return folder
-
-
-@pytest.fixture
-def here(files, tmp_path):
-    """A folder with an avatar of its own."""
-    shutil.copy(files / "small.pav", tmp_path / "small.pav")
-    return tmp_path
-
-
 # ---- undo, save, copy, rename, delete
 
 

@@ -16,21 +16,6 @@ from open_files import add, evaluated, heads, picture, reopen, save
 from pav_blender.bridge import avatars, links
 
 
-@pytest.fixture(scope="module")
-def files(registered, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("files")
-    small.write_avatar(folder / "small.pav")
-    small.write_collection(folder / "collection")
-    return folder
-
-
-@pytest.fixture
-def here(files, tmp_path):
-    """A folder with an avatar of its own."""
-    shutil.copy(files / "small.pav", tmp_path / "small.pav")
-    return tmp_path
-
-
 @pytest.fixture
 def library(scene, files, here):
     """A saved file with a moving head in the collection "Ann"; its folder, and its picture."""

@@ -10,7 +10,6 @@ import pytest
 pytest.importorskip("bpy")
 
 import bpy
-import small
 from mathutils import Matrix, Vector
 
 from pav_blender.bridge import final, sight, viewport
@@ -20,14 +19,6 @@ from pav_blender.bridge.shot import read_shot
 from pav_blender.core.collection import read_collection
 
 SIZE = (96, 80)
-
-
-@pytest.fixture(scope="module")
-def files(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("files")
-    small.write_avatar(folder / "small.pav")
-    small.write_collection(folder / "collection")
-    return folder
 
 
 @pytest.fixture

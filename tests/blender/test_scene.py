@@ -25,14 +25,6 @@ from pav_blender.core.errors import InputError
 ROOT = Path(__file__).resolve().parents[2]
 
 
-@pytest.fixture(scope="module")
-def files(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("files")
-    small.write_avatar(folder / "small.pav")
-    small.write_collection(folder / "collection")
-    return folder
-
-
 def pav(*arguments, cwd):
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     return subprocess.run(
@@ -233,7 +225,8 @@ def test_writing_frames_goes_on_where_it_stopped(scene, files, tmp_path):
     untouched = third.stat().st_mtime_ns
     scene.render.filepath = str(tmp_path / "frames") + "/"
     work = sequence.begin(scene, tmp_path / "frames")
-    sequence.blocking(work, lambda message: None)
+    while not work.step():
+        work.wait()
     assert (work.kept, work.error) == (2, "")
     assert second.read_bytes() == whole
     assert third.stat().st_mtime_ns == untouched

@@ -28,14 +28,6 @@ from pav_blender.core.version import version
 ROOT = Path(__file__).resolve().parents[2]
 
 
-@pytest.fixture(scope="module")
-def files(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("files")
-    small.write_avatar(folder / "small.pav")
-    small.write_collection(folder / "collection")
-    return folder
-
-
 @pytest.fixture
 def made(scene, files):
     found = bridge_scene.build_scene(
@@ -62,7 +54,8 @@ def drawn(monkeypatch):
 
 def write(folder):
     work = sequence.begin(bpy.context.scene, folder)
-    sequence.blocking(work, lambda message: None)
+    while not work.step():
+        work.wait()
     assert work.error == ""
     assert work.done == work.total
     return work

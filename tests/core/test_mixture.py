@@ -13,7 +13,7 @@ from pav_blender.core.evaluation.metrics import over, psnr
 from pav_blender.core.field.mixture import EMPTY, SOLID, Mixture, at_samples, mix
 from pav_blender.core.rendering.render import render
 from pav_blender.core.rendering.sequence import parse_appearance
-from pav_blender.core.rendering.wearing import shares_of, wearing_of
+from pav_blender.core.rendering.wearing import deformer_of, shares_of, wearing_of
 from pav_blender.core.training.frames import camera_of
 
 densities = st.floats(0, 1e3)  # a millimetre: from nothing to what nothing passes
@@ -107,6 +107,25 @@ def test_only_what_is_worn_somewhere_counts(toy_avatar):
     assert rows == (toy_avatar.appearances.index("plain"),)
     assert (shares == 1).all()
     assert wearing_of(toy_avatar, {"plain": 3.0}).mixture is None
+
+
+def test_shares_are_sharp_on_the_mesh_and_blurred_away_from_it(toy_avatar):
+    right = (toy_avatar.canonical_vertices[:, 0] > 0).astype(np.float32)
+    mixture = wearing_of(toy_avatar, {"plain": 1 - right, "bushy": right}).mixture
+    size = mixture.filled.shape[-1]
+    middles = (np.argwhere(mixture.filled.any(0).numpy()) + 0.5) / size * toy_avatar.box_size
+    points = torch.from_numpy((middles + toy_avatar.box_min).astype(np.float32))
+    deformer = deformer_of(toy_avatar)
+    mesh = deformer.pose(toy_avatar.canonical_vertices)
+    distance = deformer.nearest(mesh, points)[2].numpy()
+    unit = torch.from_numpy((middles / toy_avatar.box_size).astype(np.float32))
+    shares = at_samples(mixture, unit)[0].numpy()
+    np.testing.assert_allclose(shares.sum(1), 1, atol=1e-5)
+    between = (shares[:, 0] > 0.02) & (shares[:, 0] < 0.98)
+    near, far = distance < 0.004, distance > 0.03
+    assert near.any()
+    assert far.any()
+    assert between[far].mean() > 1.5 * between[near].mean()
 
 
 def test_each_half_of_a_head_wears_its_own(toy, toy_avatar):

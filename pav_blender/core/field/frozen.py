@@ -53,8 +53,8 @@ def freeze(
         field.corner_uvs if surface else field.corner_uvs[:0],
         (config.density_bias, rise, config.mesh_falloff, config.mesh_skin),
         config.log_density_limit,
-        one if mixture is None else mixture.shares,
-        one.bool() if mixture is None else mixture.filled,
+        one if mixture is None else mixture.shares.cpu(),
+        one.bool() if mixture is None else mixture.filled.cpu(),
         (EMPTY, SOLID, FIRMNESS, THICK),
     )
 

@@ -19,7 +19,7 @@ from ..field.avatar import Avatar
 from ..field.directions import spherical_harmonics
 from ..field.field import Samples, condition
 from ..field.frozen import freeze
-from ..field.mixture import Mixture, geometry
+from ..field.mixture import geometry
 from ..kernels.cpu.threads import run_chunks, torch_alone
 from ..kernels.structures import Frozen, Picks, Probing, Traced, Wave
 from .cameras import Camera
@@ -338,9 +338,7 @@ def _geometry(
     if wearing.mixture is None:
         sigma, inputs = field.geometry(samples, wearing.worn)
         return sigma, [(inputs, 1.0)]
-    device = field.device
-    mixture = Mixture(wearing.mixture.shares.to(device), wearing.mixture.filled.to(device))
-    sigma, parts, seen = geometry(field, mixture, wearing.worn, samples)
+    sigma, parts, seen = geometry(field, wearing.mixture, wearing.worn, samples)
     return sigma, list(zip(seen, parts.T, strict=True))
 
 

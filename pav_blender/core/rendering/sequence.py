@@ -11,7 +11,7 @@ import numpy as np
 from ..collection import Clip, Collection, identity_distance, read_collection, relative_clip
 from ..collection.relative import OTHER_PERSON
 from ..devices import device_of
-from ..errors import InputError
+from ..errors import InputError, OtherPerson
 from ..field.avatar import Avatar
 from ..progress import Report
 from .cameras import Camera
@@ -79,11 +79,11 @@ def check_head(avatar: Avatar, collection: Collection) -> None:
 def check_identity(
     avatar: Avatar, collection: Collection, advice: str = "add --other-identity"
 ) -> None:
-    """InputError where the track is another person's; `advice`: how to drive with it anyway."""
+    """OtherPerson where the track is another person's; `advice`: how to drive with it anyway."""
     own = collection.head_with(avatar.head_offset).shaped(avatar.betas)
     distance = identity_distance(collection.head, own, collection.head.shaped(collection.betas))
     if distance > OTHER_PERSON:
-        raise InputError(
+        raise OtherPerson(
             f"{collection.path}: tracked on another person, whose face is {1e3 * distance:.1f} mm "
             f"off the avatar's (up to {1e3 * OTHER_PERSON:g} mm is one person): {advice} to drive "
             "the avatar with it anyway, best relative to its neutral"

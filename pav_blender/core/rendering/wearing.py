@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import weakref
 from collections import OrderedDict
 from collections.abc import Mapping
@@ -39,7 +40,11 @@ class Wearing:
 _deformers: weakref.WeakKeyDictionary[Avatar, Deformer] = weakref.WeakKeyDictionary()
 _spaces: weakref.WeakKeyDictionary[Avatar, dict[int, Clearance]] = weakref.WeakKeyDictionary()
 _guides: weakref.WeakKeyDictionary[Avatar, dict[int, torch.Tensor]] = weakref.WeakKeyDictionary()
-_nearest: weakref.WeakKeyDictionary[Avatar, tuple[np.ndarray, ...]] = weakref.WeakKeyDictionary()
+_nearest: weakref.WeakKeyDictionary[Avatar, _Surroundings] = weakref.WeakKeyDictionary()
+_places: weakref.WeakKeyDictionary[
+    Avatar,
+    OrderedDict[tuple[tuple[int, ...], bytes], tuple[torch.Tensor, Clearance, torch.Tensor]],
+] = weakref.WeakKeyDictionary()
 _mixed: weakref.WeakKeyDictionary[Avatar, OrderedDict[tuple[tuple[int, ...], bytes], Wearing]] = (
     weakref.WeakKeyDictionary()
 )
@@ -94,17 +99,33 @@ def shares_of(avatar: Avatar, appearance: Appearance) -> tuple[tuple[int, ...], 
 
 
 def _mix(avatar: Avatar, rows: tuple[int, ...], shares: np.ndarray) -> Wearing:
-    filled = torch.from_numpy(avatar.occupied[list(rows)])
     spread = torch.from_numpy(_in_space(avatar, shares))
-    present = neighbourhood(spread) > 0
-    # a mixture is nowhere denser than the densest of what is mixed there
-    guides = torch.stack([guide_of(avatar, row) for row in rows])
-    return Wearing(
-        avatar.field.wearing(list(rows)),
-        Mixture(spread, filled),
-        clearance_of((filled & present).any(0).numpy(), avatar.box_min, avatar.box_size),
-        torch.where(present, guides, 0).amax(0),
-    )
+    present = neighbourhood((spread > 0).float()) > 0
+    filled, space, guide = _where(avatar, rows, present)
+    device = avatar.field.device
+    mixture = Mixture(spread.to(device), filled.to(device))
+    return Wearing(avatar.field.wearing(list(rows)), mixture, space, guide)
+
+
+def _where(
+    avatar: Avatar, rows: tuple[int, ...], present: torch.Tensor
+) -> tuple[torch.Tensor, Clearance, torch.Tensor]:
+    """Which cells each appearance fills [K, G, G, G], where any is that is `present` there, and
+    the greatest density to expect: a mixture is nowhere denser than the densest of what is mixed.
+
+    Kept: while weights change from frame to frame, where something is does not.
+    """
+    known = _places.setdefault(avatar, OrderedDict())
+    key = rows, hashlib.sha256(np.packbits(present.numpy()).tobytes()).digest()
+    if key not in known:
+        filled = torch.from_numpy(avatar.occupied[list(rows)])
+        guides = torch.stack([guide_of(avatar, row) for row in rows])
+        space = clearance_of((filled & present).any(0).numpy(), avatar.box_min, avatar.box_size)
+        known[key] = filled, space, torch.where(present, guides, 0).amax(0)
+        while len(known) > _KEPT:
+            known.popitem(last=False)
+    known.move_to_end(key)
+    return known[key]
 
 
 def _in_space(avatar: Avatar, shares: np.ndarray) -> np.ndarray:
@@ -115,36 +136,50 @@ def _in_space(avatar: Avatar, shares: np.ndarray) -> np.ndarray:
     """
     if (shares == shares[:1]).all():
         return shares[0, :, None, None, None]
-    cells, corners, weights, distance = _nearest_points(avatar)
+    about = _surroundings(avatar)
     size = avatar.occupied.shape[1]
-    here = tuple(cells.T)
-    sharp = np.zeros((shares.shape[1], size, size, size), np.float32)
-    sharp[:, *here] = (shares[corners] * weights[..., None]).sum(1).T
-    known = np.zeros((size, size, size), np.float32)
-    known[here] = 1
-    blur = _BLUR * size / avatar.box_size
-    near = np.maximum(ndimage.gaussian_filter(known, blur), 1e-9)
-    soft = np.stack([ndimage.gaussian_filter(grid, blur) for grid in sharp]) / near
-    away = np.ones_like(known)
-    away[here] = np.clip((distance - _CLOSE) / (_AWAY - _CLOSE), 0, 1)
-    spread = (1 - away) * sharp + away * soft
-    spread[spread < _SOME] = 0
-    total = spread.sum(0)
-    spread[0] += total == 0  # nothing is there
+    spread = np.zeros((shares.shape[1], size, size, size), np.float32)
+    found = (shares[about.corners] * about.weights[..., None]).sum(1)
+    for grid, values in zip(spread[1:], found.T[1:], strict=True):
+        grid[about.cells] = values
+        soft = ndimage.gaussian_filter(grid, _BLUR * size / avatar.box_size) / about.near
+        grid += about.away * (soft - grid)
+        grid[grid < _SOME] = 0
+    spread[0] = 1 - spread[1:].sum(0)
+    spread[0][spread[0] < _SOME] = 0
     return spread / spread.sum(0)
 
 
-def _nearest_points(avatar: Avatar) -> tuple[np.ndarray, ...]:
-    """Cells [N, 3] that anything fills; of the mesh's points nearest to their middles the vertices
-    [N, 3], their weights [N, 3], and the distances [N]. Computed once."""
+@dataclass(frozen=True, eq=False)
+class _Surroundings:
+    """cells: those that anything fills, as an index of a grid; of the mesh's points nearest to
+    their middles the vertices, corners [N, 3], and weights [N, 3]; near [G, G, G]: the cells
+    themselves, blurred; away [G, G, G]: how far from the mesh a cell is, from 0 to 1."""
+
+    cells: tuple[np.ndarray, ...]
+    corners: np.ndarray
+    weights: np.ndarray
+    near: np.ndarray
+    away: np.ndarray
+
+
+def _surroundings(avatar: Avatar) -> _Surroundings:
+    """Computed once."""
     if avatar not in _nearest:
         cells = np.argwhere(avatar.occupied.any(0))
-        points = (cells + 0.5) / avatar.occupied.shape[1] * avatar.box_size + avatar.box_min
+        size = avatar.occupied.shape[1]
+        points = (cells + 0.5) / size * avatar.box_size + avatar.box_min
         deformer = deformer_of(avatar)
         mesh = deformer.pose(avatar.canonical_vertices)
         found = deformer.nearest(mesh, torch.from_numpy(points).float())
         triangle, weights, distance = (values.numpy() for values in found)
-        _nearest[avatar] = cells, avatar.triangles[triangle], weights, distance
+        index = tuple(cells.T)
+        known, away = np.zeros((size,) * 3, np.float32), np.ones((size,) * 3, np.float32)
+        known[index] = 1
+        near = ndimage.gaussian_filter(known, _BLUR * size / avatar.box_size).clip(1e-9)
+        away[index] = np.clip((distance - _CLOSE) / (_AWAY - _CLOSE), 0, 1)
+        corners = avatar.triangles[triangle]
+        _nearest[avatar] = _Surroundings(index, corners, weights, near, away)
     return _nearest[avatar]
 
 
