@@ -27,6 +27,7 @@ VERBS = {
     "export": "a collection in INSTA's or VHAP's layout, or as posed meshes",
     "head": "a head file out of any Blender mesh with shape keys",
     "scene": "build a Blender scene of an avatar on a track",
+    "table": "reproduce a table of the paper: ablation, comparison, efficiency",
     "bench": "measure speed against error: render, train, kernels, scale, matte, track",
     "info": "what an avatar file holds",
     "doctor": "what this machine offers: packages, versions, threads",

@@ -132,6 +132,12 @@ class Config:
         sizes = {"none": 0, "global": self.global_channels}
         return sizes.get(self.appearance, self.latent_channels)
 
+    @property
+    def one_geometry(self) -> bool:
+        """Whether all appearances have one density, and so fill the same space: INSTA, and the
+        paper's ablation without an offset."""
+        return not (self.density_offset and self.embedding_channels)
+
     def to_json(self) -> dict[str, Any]:
         return dataclasses.asdict(self)
 

@@ -36,6 +36,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--frames", type=int, default=60, help="pictures a clip")
     parser.add_argument("--size", type=int, default=256, help="pixels a side")
     parser.add_argument("--seed", type=int, default=0, help="who it is and what they do")
+    parser.add_argument(
+        "--performance",
+        type=int,
+        default=0,
+        metavar="N",
+        help="another performance before another camera: poses no other has",
+    )
     parser.add_argument("--truth", choices=("full", "light"), default="full",
                         help="full: also depth and posed vertices")  # fmt: skip
     parser.add_argument("--overwrite", action="store_true", help="replace a collection there")
@@ -60,7 +67,8 @@ def run(args: argparse.Namespace) -> int:
 
     render_collection(
         args.out, appearances=args.appearances, frames=args.frames, size=args.size,
-        seed=args.seed, truth=args.truth, overwrite=args.overwrite, progress=progress,
+        seed=args.seed, performance=args.performance, truth=args.truth, overwrite=args.overwrite,
+        progress=progress,
     )  # fmt: skip
     print(args.out)
     return 0

@@ -51,27 +51,30 @@ class Picture:
 
 def render_collection(
     out: Path, *, appearances: int = 3, frames: int = 60, size: int = 256, seed: int = 0,
-    views=VIEWS, truth: str = "full", progress: Progress | None = None, overwrite: bool = False,
-    samples: int | None = None,
+    performance: int = 0, views=VIEWS, truth: str = "full", progress: Progress | None = None,
+    overwrite: bool = False, samples: int | None = None,
 ) -> Path:  # fmt: skip
     """Render `appearances` clips of `frames` pictures of `size` x `size` and write a collection.
 
     `views` are orbit angles in degrees of held-out cameras, one extra picture a clip each. `truth`
-    "full" adds the posed vertices and depth to the parameters, labels and mattes. `progress` gets
-    (fraction done, what). The result depends on the arguments only. Raises InputError.
+    "full" adds the posed vertices and depth to the parameters, labels and mattes. `performance`
+    numbers what the person does, before which camera: the same person in the same looks is filmed
+    doing other things. `progress` gets (fraction done, what). The result depends on the arguments
+    only. Raises InputError.
     """
-    _check(appearances, frames, size, truth)
+    _check(appearances, frames, size, performance, truth)
     head = builtin_head()
     person = build_person(head, identity(head, seed))
     looks = APPEARANCES[:appearances]
     total, done = appearances * (frames + len(views)), 0
     extra = {
         "made_by": "pav studio", "seed": seed, "frames": frames, "truth": truth,
+        "performance": performance,
         "head_fingerprint": head.fingerprint,
     }  # fmt: skip
     with CollectionWriter(out, "builtin", person.betas, extra=extra, overwrite=overwrite) as writer:
         for look in looks:
-            shots = plan(person, look, frames, size, seed, views)
+            shots = plan(person, look, frames, size, (seed, performance), views)
             vertices = []
             with filming(person, look, size, seed, samples) as take:
                 for shot in shots:
@@ -85,19 +88,23 @@ def render_collection(
                     if progress:
                         progress(done / total, f"{look.name} {shot.frame_id}")
             writer.clip(_clip(look, shots, size, vertices))
-        note = _note(appearances, frames, size, seed, truth, len(views))
+        note = _note(appearances, frames, size, (seed, performance), truth, len(views))
         write_text(writer.root / "README.md", note)
     return Path(out)
 
 
-def _note(appearances: int, frames: int, size: int, seed: int, truth: str, views: int) -> str:
+def _note(
+    appearances: int, frames: int, size: int, seeds: tuple[int, int], truth: str, views: int
+) -> str:
     """What the folder is, how it was made, and whose it is."""
+    seed, performance = seeds
+    other = f" --performance {performance}" if performance else ""
     return f"""# A synthetic person in {appearances} appearances
 
 Made by one command; nobody was filmed:
 
     pav studio THIS_FOLDER --appearances {appearances} --frames {frames} --size {size} \\
-        --seed {seed} --truth {truth}
+        --seed {seed}{other} --truth {truth}
 
 One clip an appearance: {frames} frames of one performance (the last sixth is held out: split
 "test") and {views} pictures from cameras that no clip used (split "view"). Cycles renders the
@@ -109,11 +116,12 @@ Licence: CC0 1.0 (public domain), https://creativecommons.org/publicdomain/zero/
 """
 
 
-def _check(appearances: int, frames: int, size: int, truth: str) -> None:
+def _check(appearances: int, frames: int, size: int, performance: int, truth: str) -> None:
     for what, value, low, high in (
         ("appearances", appearances, 1, len(APPEARANCES)),
         ("frames", frames, 2, 100_000),
         ("size", size, 32, 4096),
+        ("performance", performance, 0, 100_000),
     ):
         if not low <= value <= high:
             raise InputError(f"{what} {value}: give {low} to {high}")
@@ -122,10 +130,15 @@ def _check(appearances: int, frames: int, size: int, truth: str) -> None:
 
 
 def plan(
-    person: Person, look: Appearance, frames: int, size: int, seed: int, views=VIEWS
+    person: Person, look: Appearance, frames: int, size: int, seeds: tuple[int, int], views=VIEWS
 ) -> list[Shot]:
-    """The shots of one clip: training frames, the last sixth held out, then other cameras."""
-    rng = np.random.default_rng([seed, 100 + APPEARANCES.index(look)])
+    """The shots of one clip: training frames, the last sixth held out, then other cameras.
+
+    seeds: of the person and of the performance.
+    """
+    seed, performance = seeds
+    others = [performance] if performance else []
+    rng = np.random.default_rng([seed, 100 + APPEARANCES.index(look), *others])
     motion = perform(person.head, frames, rng)
     height = FRAME_HEIGHT * rng.uniform(0.97, 1.04)
     distance = rng.uniform(1.05, 1.35)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -95,6 +95,14 @@ class Collection:
                 return clip
         names = ", ".join(clip.name for clip in self.clips)
         raise InputError(f"{self.path}: no clip named {name!r}; it has {names}")
+
+    def only(self, appearance: str) -> Collection:
+        """The same person's clips of one appearance alone."""
+        clips = [clip for clip in self.clips if clip.appearance == appearance]
+        if not clips:
+            names = ", ".join(self.appearances)
+            raise InputError(f"{self.path}: no appearance named {appearance!r}; it has {names}")
+        return replace(self, clips=clips)
 
     def image_path(self, clip: Clip, row: int) -> Path:
         return self._picture("images", clip, row)

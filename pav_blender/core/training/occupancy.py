@@ -48,6 +48,7 @@ class Visibility:
         occupied = avatar.occupied
         self.occupied = occupied
         self._box = avatar.box_min, avatar.box_size
+        self._one_geometry = avatar.config.one_geometry
         distance = mesh_distance(avatar, deformer)
         self._near = (distance <= _UNSEEN_REACH).numpy()
         density = torch.exp(avatar.field.untrained(distance)) * 1e3
@@ -135,6 +136,8 @@ class Visibility:
         filled = self.filled.numpy().reshape(shape) & ~hidden
         for index, cells in enumerate(filled):  # a surface may move into a neighbour
             self.occupied[index] &= ndimage.binary_dilation(cells)
+        if self._one_geometry:  # what one appearance shows, the others cannot lack
+            self.occupied[:] = self.occupied.any(axis=0)
         self.weight[judged] = 0
         self.looks[judged] = 0
         self._refresh()

@@ -51,6 +51,8 @@ def new_avatar(collection: Collection, frames: list[Frame], config: Config) -> A
         for group, reach in zip(groups, reaches, strict=True)
     ]
     occupied = np.stack([_doubled(hull)[:cells, :cells, :cells] for hull in hulls])
+    if config.one_geometry:
+        occupied[:] = occupied.any(axis=0)
     return Avatar.create(
         config,
         collection.appearances,

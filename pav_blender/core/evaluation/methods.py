@@ -1,0 +1,45 @@
+"""The methods that the paper's tables compare, as settings of one and the same code."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+from ..config import Config
+from ..errors import InputError
+
+_PAPER = Config.paper()
+
+
+@dataclass(frozen=True)
+class Method:
+    """key names its files; title is what tables call it; per_clip: a network for each appearance
+    instead of one for all."""
+
+    key: str
+    title: str
+    config: Config
+    per_clip: bool = False
+
+
+_INSTA = dataclasses.replace(_PAPER, appearance="none")
+# Z_j as the paper has it, a texture of 512 x 512 x 16 a clip
+_FULL = dataclasses.replace(_PAPER, appearance="surface")
+
+METHODS = (
+    Method("insta", "INSTA, unified", _INSTA),
+    Method("insta_clips", "INSTA, one a clip", _INSTA, per_clip=True),
+    Method("no_lnf", "PAV without LNF", dataclasses.replace(_FULL, appearance="global")),
+    Method("no_offset", "PAV without density offset", dataclasses.replace(_FULL, density_offset=False)),
+    Method("vertex", "PAV, features a vertex", dataclasses.replace(_FULL, appearance="vertex")),
+    Method("full", "PAV, full", _FULL),
+    Method("ours", "ours", Config()),
+)  # fmt: skip
+
+
+def method(key: str) -> Method:
+    """The method of that key; InputError naming those there are."""
+    for one in METHODS:
+        if one.key == key:
+            return one
+    raise InputError(f"method {key!r}: one of {', '.join(m.key for m in METHODS)}")

@@ -1,0 +1,192 @@
+"""Training and measuring the methods of a table, each once: what is there already is kept."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from ..collection import Collection
+from ..errors import Cancelled, InputError
+from ..field.avatar import Avatar, read_header
+from ..files import write_text
+from ..images import write_rgba
+from ..progress import Report
+from ..training.places import checkpoint_path
+from ..training.train import fingerprint, train
+from .evaluate import Evaluation, evaluate, summary
+from .heldout import Score
+from .methods import Method
+
+# what is measured: held-out frames, cameras that no clip used, another performance
+SETS = ("test", "view", "novel")
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """What all methods of a table share. novel: another performance of the same person in the same
+    appearances, all of it unseen; weights: where perceptual metrics find theirs."""
+
+    collection: Collection
+    out: Path
+    iterations: int
+    novel: Collection | None = None
+    per_appearance: int | None = None
+    weights: Path | None = None
+
+    @property
+    def sets(self) -> tuple[str, ...]:
+        """Those of SETS that there are pictures of."""
+        splits = {split for clip in self.collection.clips for split in clip.split.tolist()}
+        return tuple(s for s in SETS if s in splits or (s == "novel" and self.novel is not None))
+
+
+@dataclass(eq=False)
+class Result:
+    """One training of a method, all its networks together: seconds, parameters and bytes are
+    their sums; measures: each set's metrics (`evaluate.summary`)."""
+
+    method: Method
+    seed: int
+    seconds: float
+    parameters: int
+    bytes: int
+    measures: dict[str, dict[str, float | str]]
+
+
+def result(
+    study: Study,
+    method: Method,
+    seed: int,
+    *,
+    progress: Report | None = None,
+    measuring: Report | None = None,
+    should_stop: Callable[[], bool] | None = None,
+) -> Result:
+    """Trains what is missing and measures what was not measured; both are kept in `study.out`, so
+    that an interrupted study goes on where it was. Raises Cancelled, InputError."""
+    paths = _train(study, method, seed, progress, should_stop)
+    known = study.out / f"{method.key}-{seed}.json"
+    # seconds tell trainings apart that are equal otherwise
+    trained = [read_header(path)["record"] for path in paths]
+    source = {
+        "trained": [[record["collection"], record["seconds"]] for record in trained],
+        "novel": fingerprint(study.novel) if study.novel else None,
+        "per_appearance": study.per_appearance,
+    }
+    stored = _read(known)
+    if stored.get("source") != source:
+        stored = {"source": source, "sets": {}}
+    missing = [name for name in study.sets if name not in stored["sets"]]
+    if missing:
+        avatars = [Avatar.load(path) for path in paths]
+        stored["parameters"] = sum(
+            p.numel() for avatar in avatars for p in avatar.field.parameters()
+        )
+        for name in missing:
+            if should_stop is not None and should_stop():
+                raise Cancelled(f"stopped; what was measured is in {study.out}")
+            evaluation = _measure(study, avatars, name, measuring)
+            stored["sets"][name] = {"summary": summary(evaluation), "rows": evaluation.rows}
+            if name == "test":
+                _keep_examples(study, method, seed, evaluation.scores)
+            write_text(known, json.dumps(stored, indent=1) + "\n")
+    return Result(
+        method,
+        seed,
+        sum(record["seconds"] for record in trained),
+        stored["parameters"],
+        sum(path.stat().st_size for path in paths),
+        {name: stored["sets"][name]["summary"] for name in study.sets},
+    )
+
+
+def example_path(study: Study, method: Method, seed: int, appearance: str) -> Path:
+    """The picture of an appearance's middle held-out frame."""
+    return study.out / "examples" / f"{method.key}-{seed}" / f"{appearance}.png"
+
+
+def _train(
+    study: Study,
+    method: Method,
+    seed: int,
+    progress: Report | None,
+    should_stop: Callable[[], bool] | None,
+) -> list[Path]:
+    """The files of a method's networks."""
+    config = replace(method.config, seed=seed, iterations=study.iterations)
+    parts: dict[str, Collection] = {f"{method.key}-{seed}": study.collection}
+    if method.per_clip:
+        parts = {
+            f"{method.key}-{seed}-{name}": study.collection.only(name)
+            for name in study.collection.appearances
+        }
+    paths = []
+    for number, (name, part) in enumerate(parts.items()):
+        path = study.out / f"{name}.pav"
+        paths.append(path)
+        if _is_trained(path, part, config.to_json()):
+            continue
+
+        def report(done: float, *, at: int = number, **fields: Any) -> None:
+            if progress:
+                progress((at + done) / len(parts), **fields)
+
+        train(
+            part,
+            path,
+            config,
+            resume=checkpoint_path(path).is_file(),
+            progress=report,
+            should_stop=should_stop,
+        )
+    return paths
+
+
+def _is_trained(path: Path, part: Collection, config: dict[str, Any]) -> bool:
+    if not path.is_file():
+        return False
+    header = read_header(path)
+    return header["config"] == config and header["record"].get("collection") == fingerprint(part)
+
+
+def _measure(study: Study, avatars: list[Avatar], name: str, progress: Report | None) -> Evaluation:
+    """All networks' measures of a set, as if one had made them."""
+    collection, splits = study.collection, (name,)
+    if name == "novel":
+        assert study.novel is not None
+        collection, splits = study.novel, ("train", "test")
+    parts = [
+        evaluate(
+            avatar,
+            collection,
+            splits=splits,
+            per_appearance=study.per_appearance,
+            weights=study.weights,
+            progress=progress,
+        )
+        for avatar in avatars
+    ]
+    return Evaluation(
+        [row for part in parts for row in part.rows],
+        parts[0].absent,
+        [score for part in parts for score in part.scores],
+    )
+
+
+def _keep_examples(study: Study, method: Method, seed: int, scores: list[Score]) -> None:
+    for name in study.collection.appearances:
+        own = [score for score in scores if score.appearance == name]
+        write_rgba(example_path(study, method, seed, name), own[len(own) // 2].rendered)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        return {}
+    try:
+        stored = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise InputError(f"{path}: not what a study wrote ({error}); remove it") from error
+    return stored if isinstance(stored, dict) else {}
