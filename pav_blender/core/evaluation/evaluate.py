@@ -42,6 +42,7 @@ METRICS: tuple[Metric, ...] = (
     Metric("DISTS", "", False, "dists"),
     Metric("FID", "", False, "fid"),
 )
+KEYS = tuple(one.key for one in METRICS)
 # measured of every frame beside them: opacity where it should be none, and what it lacks of one
 FIGURES: tuple[Metric, ...] = (
     Metric("fog outside", "per mille", False, "fog"),
@@ -81,7 +82,7 @@ def evaluate(
     appearances: list[str] | None = None,
     per_appearance: int | None = None,
     settings: RenderSettings | None = None,
-    metrics: Sequence[str] = tuple(metric.key for metric in METRICS),
+    metrics: Sequence[str] = KEYS,
     weights: Path | None = None,
     keep: int = 0,
     progress: Report | None = None,
@@ -95,7 +96,7 @@ def evaluate(
     InputError for unknown names, another head than the avatar's, and where there is no frame.
     """
     check_head(avatar, collection)
-    _check_names("metric", metrics, [metric.key for metric in METRICS])
+    _check_names("metric", metrics, KEYS)
     _check_names("split", splits, SPLITS)
     _check_names("appearance", appearances or [], collection.appearances)
     for name in appearances or []:

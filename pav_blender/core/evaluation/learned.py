@@ -81,7 +81,7 @@ def inception(folder: Path | None = None) -> Features:
     """The features [2048] that FID compares (Heusel et al. 2017). Raises Absent, InputError."""
     module = _package("pytorch_fid.inception", "pytorch-fid")
     state = _read(_find(INCEPTION, folder))
-    with mock.patch.object(module, "load_state_dict_from_url", lambda *_, **__: state):
+    with mock.patch.object(module, "load_state_dict_from_url", return_value=state):
         network = module.InceptionV3().eval()
 
     def features(picture: np.ndarray) -> np.ndarray:
@@ -139,7 +139,7 @@ def _backbone(name: str, file: WeightsFile, folder: Path | None) -> Iterator[Non
     network.features.load_state_dict(
         {k.removeprefix("features."): v for k, v in state.items() if k.startswith("features.")}
     )
-    with mock.patch.object(models, name, lambda **_: network):
+    with mock.patch.object(models, name, return_value=network):
         yield
 
 
