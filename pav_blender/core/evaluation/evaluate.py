@@ -18,7 +18,7 @@ from ..rendering.render import RenderSettings
 from ..rendering.sequence import check_head
 from ..training.frames import load_frames
 from . import learned
-from .heldout import BACKGROUND, Score, chosen_rows, score, spread
+from .heldout import BACKGROUND, Score, chosen_rows, score
 from .metrics import frechet, over
 
 
@@ -99,10 +99,12 @@ def evaluate(
     _check_names("metric", metrics, KEYS)
     _check_names("split", splits, SPLITS)
     _check_names("appearance", appearances or [], collection.appearances)
+    if per_appearance is not None and per_appearance < 1:
+        raise InputError(f"per_appearance {per_appearance}: at least 1")
     for name in appearances or []:
         avatar.appearance_index(name)
     if weights is not None and not weights.is_dir():
-        raise InputError(f"{weights}: no such folder of weights")
+        raise InputError(f"{weights}: no such folder; it should hold networks' weights")
     chosen = [n for n in appearances or collection.appearances if n in avatar.appearances]
     todo = _frames(collection, chosen, splits, per_appearance, keep)
     if not todo:
@@ -195,7 +197,7 @@ def _frames(
     for name in appearances:
         for split in dict.fromkeys(splits):
             rows = chosen_rows(collection, name, (split,), per_appearance)
-            kept = set(spread(list(range(len(rows))), keep)) if keep else set()
+            kept = set(np.linspace(-1, len(rows), keep + 2)[1:-1].round().astype(int))
             found += [(clip, row, split, i in kept) for i, (clip, row) in enumerate(rows)]
     for clip, *_ in found:
         if min(clip.width, clip.height) < learned.SMALLEST:

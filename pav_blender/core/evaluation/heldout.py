@@ -102,11 +102,6 @@ def chosen_rows(
     """Rows of an appearance's clips in any of the splits: all, or `at_most`, evenly spread."""
     clips = [c for c in collection.clips if c.appearance == appearance]
     rows = [(clip, int(row)) for clip in clips for row in clip.indices(*splits)]
-    return rows if at_most is None else spread(rows, at_most)
-
-
-def spread(items: list, at_most: int) -> list:
-    """At most so many of the items, evenly spread from the first to the last."""
-    if len(items) <= at_most:
-        return items
-    return [items[i] for i in np.linspace(0, len(items) - 1, at_most).round().astype(int)]
+    if at_most is None or len(rows) <= at_most:
+        return rows
+    return [rows[i] for i in np.linspace(0, len(rows) - 1, at_most).round().astype(int)]

@@ -107,9 +107,11 @@ def _package(module: str, name: str) -> Any:
     """Imports it; Absent where it, or torchvision beneath it, is missing or does not load."""
     try:
         return importlib.import_module(module)
-    except (ImportError, OSError, RuntimeError) as error:  # torchvision for another torch: Runtime
-        line = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise Absent("package absent", f"pip install {name} ({line})") from error
+    except ModuleNotFoundError as error:
+        raise Absent("package absent", f"{error}: pip install {name}") from error
+    except (ImportError, OSError, RuntimeError) as error:
+        # a torchvision that was built for another torch, as a rule
+        raise Absent("package absent", f"{name} does not load: {error}") from error
 
 
 @contextlib.contextmanager
@@ -150,7 +152,7 @@ def _find(file: WeightsFile, folder: Path | None) -> Path:
     for place in places:
         if (place / file.name).is_file():
             return place / file.name
-    raise Absent("weights absent", file.name)
+    raise Absent("weights absent", f"{file.name} is not in {' or '.join(map(str, places))}")
 
 
 def _read(path: Path) -> dict[str, torch.Tensor]:
