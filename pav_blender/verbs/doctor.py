@@ -22,11 +22,19 @@ OPTIONAL = {
     "fast_simplification": "`pav bake`",
     "trimesh": "`pav bake`",
     "PIL": "`pav bake`",
+    "stlpips_pytorch": "`pav eval`: ST-LPIPS",
+    "torchvision": "`pav eval`: LPIPS, DISTS and FID",
+    "lpips": "`pav eval`: LPIPS",
+    "DISTS_pytorch": "`pav eval`: DISTS",
+    "pytorch_fid": "`pav eval`: FID",
 }
 _DISTRIBUTIONS = {
     "skimage": "scikit-image",
     "fast_simplification": "fast-simplification",
     "PIL": "pillow",
+    "stlpips_pytorch": "stlpips-pytorch",
+    "DISTS_pytorch": "DISTS-pytorch",
+    "pytorch_fid": "pytorch-fid",
 }
 
 

@@ -130,7 +130,8 @@ def _write(args: argparse.Namespace, study: Any, results: dict[str, list[Any]]) 
     write_text(args.out / f"{args.name}.md", text)
     write_text(args.out / f"{args.name}.tex", "\n".join(latex(table) for table in tables))
     methods = [m for m in METHODS if m.key in results]
-    draw_figure(study, methods, 0, args.out / f"{args.name}.png")
+    examples = results[methods[0].key][0].examples
+    draw_figure(study, methods, 0, examples, args.out / f"{args.name}.png")
     print(text)
     fields = {
         "caption": caption,

@@ -9,26 +9,29 @@ from typing import Any
 
 import numpy as np
 
+from ..collection import Collection
 from ..errors import InputError
 from ..files import replacing
 from ..images import read_rgba
 from ..rendering.rasterise import rasterise
-from ..training.frames import Frame
-from .heldout import BACKGROUND, chosen_frames
-from .metrics import over
+from ..training.frames import Frame, load_frames
+from .heldout import BACKGROUND
 from .methods import Method
+from .metrics import over
 from .sheet import error_map
 from .study import Study, example_path
 
 
-def draw_figure(study: Study, methods: list[Method], seed: int, path: Path) -> None:
-    """A PNG: two rows an appearance, of the middle held-out frame. InputError without matplotlib."""
+def draw_figure(
+    study: Study, methods: list[Method], seed: int, examples: dict[str, str], path: Path
+) -> None:
+    """A PNG: two rows an appearance. examples: the frame ("clip/number") shown of each
+    (`study.Result`). InputError without matplotlib."""
     try:
         figure_module: Any = importlib.import_module("matplotlib.figure")
     except ImportError as error:
         raise InputError("figures need matplotlib: `pip install matplotlib`") from error
     collection = study.collection
-    frames = chosen_frames(collection, ("test",), study.per_appearance)
     rows, columns = 2 * len(collection.appearances), len(methods) + 2
     figure = figure_module.Figure(figsize=(1.6 * columns, 1.6 * rows), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False)
@@ -38,8 +41,7 @@ def draw_figure(study: Study, methods: list[Method], seed: int, path: Path) -> N
     for cell, title in zip(axes[0], titles, strict=True):
         cell.set_title(title, fontsize=7)
     for number, name in enumerate(collection.appearances):
-        own = [f for f in frames if f.appearance == number]
-        frame = own[len(own) // 2]
+        frame = _frame(collection, examples[name])
         truth = over(frame.rgba / 255, BACKGROUND)
         top, below = axes[2 * number], axes[2 * number + 1]
         top[0].imshow(target(frame, collection.head.triangles))
@@ -51,6 +53,13 @@ def draw_figure(study: Study, methods: list[Method], seed: int, path: Path) -> N
             under.imshow(error_map(shown, truth))
     with replacing(path) as temporary:
         figure.savefig(temporary, format="png", dpi=150)
+
+
+def _frame(collection: Collection, name: str) -> Frame:
+    clip_name, _, frame_id = name.rpartition("/")
+    clip = collection.clip(clip_name)
+    row = np.flatnonzero(clip.frame_id == int(frame_id))
+    return load_frames(collection, clip, row, targets=False)[0]
 
 
 def target(frame: Frame, triangles: np.ndarray) -> np.ndarray:

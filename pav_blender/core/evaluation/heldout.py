@@ -6,19 +6,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..collection import Collection
+from ..collection import Clip, Collection
 from ..field.avatar import Avatar
 from ..progress import Report
 from ..rendering.render import RenderSettings, render
 from ..training.frames import Frame, load_frames
-from .metrics import over, psnr, ssim
+from .metrics import fog, holes, over, psnr, ssim
 
 BACKGROUND = 1.0  # pictures are compared before white
 
 
 @dataclass(eq=False)
 class Score:
-    """One frame: whole picture and head pixels in dB; rendered [H, W, 4] in [0, 1]."""
+    """One frame: whole picture and head pixels in dB; rendered [H, W, 4] in [0, 1].
+
+    fog: mean opacity outside the matte; holes: what shows through inside it; both in [0, 1].
+    """
 
     frame: Frame
     appearance: str
@@ -26,15 +29,25 @@ class Score:
     head_psnr: float
     ssim: float
     rendered: np.ndarray
+    fog: float
+    holes: float
 
 
 def head_mask(rgba: np.ndarray) -> np.ndarray:
-    """Pixels [H, W] of the person: where the matte (uint8) is more than half."""
+    """Pixels [H, W] of the person: where the matte (uint8) is more than half.
+
+    Training has no other mask: it learns from all pixels about the person, each before a random
+    background with the same matte as its share (`training.losses`). Scores take the same mattes.
+    """
     return rgba[..., 3] > 127
 
 
 def score(avatar: Avatar, frame: Frame, appearance: str, settings: RenderSettings) -> Score:
-    """Renders a frame wearing `appearance` and compares it with the frame's own picture."""
+    """Renders a frame wearing `appearance` and compares it with the frame's own picture.
+
+    `psnr` and `ssim` are of the whole picture before white, `head_psnr` of the head's pixels
+    (`head_mask`) in the same pictures.
+    """
     picture = render(
         avatar, frame.vertices, frame.camera, appearance, settings, expression=frame.expression
     )
@@ -47,6 +60,8 @@ def score(avatar: Avatar, frame: Frame, appearance: str, settings: RenderSetting
         psnr(ours, truth, head_mask(frame.rgba)),
         ssim(ours, truth),
         shown,
+        fog(picture.rgba[..., 3], frame.rgba[..., 3]),
+        holes(picture.rgba[..., 3], frame.rgba[..., 3]),
     )
 
 
@@ -76,11 +91,17 @@ def chosen_frames(
     """Frames of the splits, evenly spread, at most `per_appearance` of each appearance."""
     frames: list[Frame] = []
     for appearance in collection.appearances:
-        clips = [c for c in collection.clips if c.appearance == appearance]
-        rows = [(clip, row) for clip in clips for row in clip.indices(*splits)]
-        if per_appearance is not None and len(rows) > per_appearance:
-            at = np.linspace(0, len(rows) - 1, per_appearance).round().astype(int)
-            rows = [rows[i] for i in at]
-        for clip, row in rows:
+        for clip, row in chosen_rows(collection, appearance, splits, per_appearance):
             frames += load_frames(collection, clip, np.array([row]), targets=False)
     return frames
+
+
+def chosen_rows(
+    collection: Collection, appearance: str, splits: tuple[str, ...], at_most: int | None
+) -> list[tuple[Clip, int]]:
+    """Rows of an appearance's clips in any of the splits: all, or `at_most`, evenly spread."""
+    clips = [c for c in collection.clips if c.appearance == appearance]
+    rows = [(clip, int(row)) for clip in clips for row in clip.indices(*splits)]
+    if at_most is None or len(rows) <= at_most:
+        return rows
+    return [rows[i] for i in np.linspace(0, len(rows) - 1, at_most).round().astype(int)]

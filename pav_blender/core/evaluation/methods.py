@@ -25,12 +25,13 @@ class Method:
 _INSTA = dataclasses.replace(_PAPER, appearance="none")
 # Z_j as the paper has it, a texture of 512 x 512 x 16 a clip
 _FULL = dataclasses.replace(_PAPER, appearance="surface")
+_NO_OFFSET = dataclasses.replace(_FULL, density_offset=False)
 
 METHODS = (
     Method("insta", "INSTA, unified", _INSTA),
     Method("insta_clips", "INSTA, one a clip", _INSTA, per_clip=True),
     Method("no_lnf", "PAV without LNF", dataclasses.replace(_FULL, appearance="global")),
-    Method("no_offset", "PAV without density offset", dataclasses.replace(_FULL, density_offset=False)),
+    Method("no_offset", "PAV without density offset", _NO_OFFSET),
     Method("vertex", "PAV, features a vertex", dataclasses.replace(_FULL, appearance="vertex")),
     Method("full", "PAV, full", _FULL),
     Method("ours", "ours", Config()),

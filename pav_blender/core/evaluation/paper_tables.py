@@ -14,8 +14,14 @@ from .tables import Cell, Column, Table
 
 Results = dict[str, list[Result]]  # a method's key -> a result for each seed
 
+_DIGITS = {"ssim": 4, "st_lpips": 4, "lpips": 4, "dists": 4}
 _QUALITY = tuple(
-    Column(m.key, f"{m.name}{f' ({m.unit})' if m.unit else ''}", m.higher_is_better, m.digits)
+    Column(
+        m.key,
+        f"{m.name} ({m.unit})" if m.unit else m.name,
+        m.higher_is_better,
+        _DIGITS.get(m.key, 2),
+    )
     for m in METRICS
 )
 _TITLES = {m.key: m.title for m in METHODS}

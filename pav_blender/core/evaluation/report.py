@@ -123,7 +123,7 @@ def write_proof(
     """Writes DIR/NAME.json with its claims, prints the table; True where all are met."""
     content = {**fields, "claims": [asdict(claim) for claim in claims]}
     write_text(path, json.dumps(content, indent=1, allow_nan=True) + "\n")
-    width = max(len(claim.name) for claim in claims)
+    width = max((len(claim.name) for claim in claims), default=0)
     for claim in claims:
         mark = "met" if claim.met else "NOT MET"
         value = f"{claim.value:9.2f} {claim.unit:4} target {claim.target:g}"

@@ -16,7 +16,7 @@ from ..images import write_rgba
 from ..progress import Report
 from ..training.places import checkpoint_path
 from ..training.train import fingerprint, train
-from .evaluate import Evaluation, evaluate, summary
+from .evaluate import Evaluation, evaluate, merged, summary
 from .heldout import Score
 from .methods import Method
 
@@ -46,7 +46,8 @@ class Study:
 @dataclass(eq=False)
 class Result:
     """One training of a method, all its networks together: seconds, parameters and bytes are
-    their sums; measures: each set's metrics (`evaluate.summary`)."""
+    their sums; measures: each set's metrics (`evaluate.summary`); examples: by appearance, the
+    frame that `example_path` shows."""
 
     method: Method
     seed: int
@@ -54,6 +55,7 @@ class Result:
     parameters: int
     bytes: int
     measures: dict[str, dict[str, float | str]]
+    examples: dict[str, str]
 
 
 def result(
@@ -91,7 +93,7 @@ def result(
             evaluation = _measure(study, avatars, name, measuring)
             stored["sets"][name] = {"summary": summary(evaluation), "rows": evaluation.rows}
             if name == "test":
-                _keep_examples(study, method, seed, evaluation.scores)
+                stored["examples"] = _keep_examples(study, method, seed, evaluation.scores)
             write_text(known, json.dumps(stored, indent=1) + "\n")
     return Result(
         method,
@@ -100,11 +102,12 @@ def result(
         stored["parameters"],
         sum(path.stat().st_size for path in paths),
         {name: stored["sets"][name]["summary"] for name in study.sets},
+        stored["examples"],
     )
 
 
 def example_path(study: Study, method: Method, seed: int, appearance: str) -> Path:
-    """The picture of an appearance's middle held-out frame."""
+    """The picture of one held-out frame of an appearance."""
     return study.out / "examples" / f"{method.key}-{seed}" / f"{appearance}.png"
 
 
@@ -165,21 +168,19 @@ def _measure(study: Study, avatars: list[Avatar], name: str, progress: Report | 
             splits=splits,
             per_appearance=study.per_appearance,
             weights=study.weights,
+            keep=1,
             progress=progress,
         )
         for avatar in avatars
     ]
-    return Evaluation(
-        [row for part in parts for row in part.rows],
-        parts[0].absent,
-        [score for part in parts for score in part.scores],
-    )
+    return merged(parts)
 
 
-def _keep_examples(study: Study, method: Method, seed: int, scores: list[Score]) -> None:
-    for name in study.collection.appearances:
-        own = [score for score in scores if score.appearance == name]
-        write_rgba(example_path(study, method, seed, name), own[len(own) // 2].rendered)
+def _keep_examples(study: Study, method: Method, seed: int, scores: list[Score]) -> dict[str, str]:
+    """Writes one picture an appearance; returns whose they are: frames by appearance."""
+    for score in scores:
+        write_rgba(example_path(study, method, seed, score.appearance), score.rendered)
+    return {score.appearance: score.frame.name for score in scores}
 
 
 def _read(path: Path) -> dict[str, Any]:
