@@ -247,7 +247,7 @@ def _cycles(size: int) -> float:
     head = builtin_head()
     person = build_person(head, identity(head, 0))
     look = APPEARANCES[0]
-    shot = plan(person, look, 6, size, 0)[0]
+    shot = plan(person, look, 6, size, (0, 0))[0]
     scene = build_scene(person, look, 0)
     passes = Passes(scene.scene, size, 64)
     try:

@@ -157,10 +157,10 @@ def _is_trained(path: Path, part: Collection, config: dict[str, Any]) -> bool:
 
 def _measure(study: Study, avatars: list[Avatar], name: str, progress: Report | None) -> Evaluation:
     """All networks' measures of a set, as if one had made them."""
-    collection, splits = study.collection, (name,)
+    collection, splits = study.collection, [name]
     if name == "novel":
         assert study.novel is not None
-        collection, splits = study.novel, ("train", "test")
+        collection, splits = study.novel, ["train", "test"]
     parts = [
         evaluate(
             avatar,
