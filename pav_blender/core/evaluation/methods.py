@@ -25,12 +25,14 @@ class Method:
 _INSTA = dataclasses.replace(_PAPER, appearance="none")
 # Z_j as the paper has it, a texture of 512 x 512 x 16 a clip
 _FULL = dataclasses.replace(_PAPER, appearance="surface")
+# the paper's vector has 512 values; they enter 64 hidden units, so that 64 can do as much, sooner
+_NO_LNF = dataclasses.replace(_FULL, appearance="global", global_channels=64)
 _NO_OFFSET = dataclasses.replace(_FULL, density_offset=False)
 
 METHODS = (
     Method("insta", "INSTA, unified", _INSTA),
     Method("insta_clips", "INSTA, one a clip", _INSTA, per_clip=True),
-    Method("no_lnf", "PAV without LNF", dataclasses.replace(_FULL, appearance="global")),
+    Method("no_lnf", "PAV without LNF", _NO_LNF),
     Method("no_offset", "PAV without density offset", _NO_OFFSET),
     Method("vertex", "PAV, features a vertex", dataclasses.replace(_FULL, appearance="vertex")),
     Method("full", "PAV, full", _FULL),
