@@ -80,7 +80,7 @@ def dists(folder: Path | None = None) -> Compare:
 def inception(folder: Path | None = None) -> Features:
     """The features [2048] that FID compares (Heusel et al. 2017). Raises Absent, InputError."""
     module = _package("pytorch_fid.inception", "pytorch-fid")
-    state = _read(_find(INCEPTION, folder))
+    state = read(INCEPTION, find(INCEPTION, folder))
     with mock.patch.object(module, "load_state_dict_from_url", return_value=state):
         network = module.InceptionV3().eval()
 
@@ -136,16 +136,19 @@ def _unused_imports(*names: str) -> Iterator[None]:
 def _backbone(name: str, file: WeightsFile, folder: Path | None) -> Iterator[None]:
     """Has torchvision's constructor `name` give the network of `file` instead of fetching one."""
     models = _package("torchvision.models", "torchvision")
-    network = getattr(models, name)()
-    state = _read(_find(file, folder))
+    state = read(file, find(file, folder))
+    with torch.device("meta"):  # without memory: only the features get any, the file's
+        network = getattr(models, name)()
     network.features.load_state_dict(
-        {k.removeprefix("features."): v for k, v in state.items() if k.startswith("features.")}
+        {k.removeprefix("features."): v for k, v in state.items() if k.startswith("features.")},
+        assign=True,
     )
     with mock.patch.object(models, name, return_value=network):
         yield
 
 
-def _find(file: WeightsFile, folder: Path | None) -> Path:
+def find(file: WeightsFile, folder: Path | None) -> Path:
+    """Where it lies: in the folder, its `checkpoints`, or torch's hub cache. Raises Absent."""
     places = [Path(torch.hub.get_dir()) / "checkpoints"]
     if folder is not None:
         places = [folder, folder / "checkpoints", *places]
@@ -155,14 +158,13 @@ def _find(file: WeightsFile, folder: Path | None) -> Path:
     raise Absent("weights absent", f"{file.name} is not in {' or '.join(map(str, places))}")
 
 
-def _read(path: Path) -> dict[str, torch.Tensor]:
-    """The state in a published file. InputError where its checksum is not the one in its name."""
-    digest = path.stem.rpartition("-")[2]
+def read(file: WeightsFile, path: Path) -> dict[str, torch.Tensor]:
+    """The state in a published file. InputError where its checksum is not the file's own."""
     with open(path, "rb") as stream:
         found = hashlib.file_digest(stream, "sha256").hexdigest()
-    if not found.startswith(digest):
+    if not found.startswith(file.digest):
         raise InputError(
-            f"{path}: damaged or another file: its SHA-256 starts with {found[:8]}, not {digest}; "
-            "get it anew"
+            f"{path}: damaged or another file: its SHA-256 starts with {found[:8]}, not "
+            f"{file.digest}; get it anew"
         )
     return torch.load(path, map_location="cpu", weights_only=True)
