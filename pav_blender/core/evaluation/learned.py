@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import importlib
+import importlib.util
 import sys
 import types
 from collections.abc import Callable, Iterator
@@ -60,16 +61,17 @@ def st_lpips(folder: Path | None = None) -> Compare:
 
 def lpips(folder: Path | None = None) -> Compare:
     """LPIPS (Zhang et al. 2018), version 0.1, AlexNet. Raises Absent, InputError."""
-    module = _package("lpips", "lpips")
-    with _backbone("alexnet", ALEXNET, folder):
-        network = module.LPIPS(net="alex", verbose=False)
+    state = _weights(ALEXNET, folder, "lpips", "torchvision")
+    with _backbone("alexnet", state):
+        network = _package("lpips", "lpips").LPIPS(net="alex", verbose=False)
     return _compare(lambda a, b: network(a, b, normalize=True))
 
 
 def dists(folder: Path | None = None) -> Compare:
     """DISTS (Ding et al. 2020), pictures at their own size. Raises Absent, InputError."""
-    module = _package("DISTS_pytorch.DISTS_pt", "DISTS-pytorch")
-    with _backbone("vgg16", VGG16, folder):
+    state = _weights(VGG16, folder, "DISTS_pytorch", "torchvision")
+    with _backbone("vgg16", state):
+        module = _package("DISTS_pytorch.DISTS_pt", "DISTS-pytorch")
         network = module.DISTS(load_weights=False)
     # the package looks for its own weights where the interpreter is installed
     own = torch.load(Path(module.__file__).with_name("weights.pt"), weights_only=True)
@@ -79,8 +81,8 @@ def dists(folder: Path | None = None) -> Compare:
 
 def inception(folder: Path | None = None) -> Features:
     """The features [2048] that FID compares (Heusel et al. 2017). Raises Absent, InputError."""
+    state = _weights(INCEPTION, folder, "pytorch_fid", "torchvision")
     module = _package("pytorch_fid.inception", "pytorch-fid")
-    state = read(INCEPTION, find(INCEPTION, folder))
     with mock.patch.object(module, "load_state_dict_from_url", return_value=state):
         network = module.InceptionV3().eval()
 
@@ -103,12 +105,22 @@ def _tensor(picture: np.ndarray) -> torch.Tensor:
     return torch.from_numpy(np.ascontiguousarray(picture.transpose(2, 0, 1)[None], np.float32))
 
 
+def _weights(file: WeightsFile, folder: Path | None, *packages: str) -> dict[str, torch.Tensor]:
+    """The state in a file, where the packages are installed; they are not imported to find out."""
+    for name in packages:
+        if importlib.util.find_spec(name) is None:
+            raise Absent("package absent", f"pip install {name.replace('_', '-')}")
+    return read(file, find(file, folder))
+
+
 def _package(module: str, name: str) -> Any:
     """Imports it; Absent where it, or torchvision beneath it, is missing or does not load."""
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
-        raise Absent("package absent", f"{error}: pip install {name}") from error
+        other = error.name is not None and not module.startswith(error.name)
+        missing = error.name if other else name
+        raise Absent("package absent", f"pip install {missing}") from error
     except (ImportError, OSError, RuntimeError) as error:
         # a torchvision that was built for another torch, as a rule
         raise Absent("package absent", f"{name} does not load: {error}") from error
@@ -133,10 +145,9 @@ def _unused_imports(*names: str) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _backbone(name: str, file: WeightsFile, folder: Path | None) -> Iterator[None]:
-    """Has torchvision's constructor `name` give the network of `file` instead of fetching one."""
+def _backbone(name: str, state: dict[str, torch.Tensor]) -> Iterator[None]:
+    """Has torchvision's constructor `name` give the network of `state` instead of fetching one."""
     models = _package("torchvision.models", "torchvision")
-    state = read(file, find(file, folder))
     with torch.device("meta"):  # without memory: only the features get any, the file's
         network = getattr(models, name)()
     network.features.load_state_dict(
