@@ -152,12 +152,26 @@ def offline(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("load", [learned.lpips, learned.dists, learned.inception])
-def test_without_weights_a_metric_is_absent_and_nothing_is_fetched(load, offline):
+def test_a_metric_that_lacks_something_is_absent_and_nothing_is_fetched(load, offline, monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: name)
     with pytest.raises(learned.Absent) as absent:
         load(offline)
-    assert absent.value.reason in ("weights absent", "package absent")
-    if absent.value.reason == "weights absent":
-        assert str(offline) in absent.value.needs
+    assert absent.value.reason == "weights absent"
+    assert str(offline) in absent.value.needs
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: name != "torchvision" or None)
+    with pytest.raises(learned.Absent) as absent:
+        load(offline)
+    assert (absent.value.reason, absent.value.needs) == (
+        "package absent",
+        "pip install torchvision",
+    )
+
+
+def test_a_package_that_does_not_load_is_absent(monkeypatch):
+    monkeypatch.setitem(sys.modules, "stlpips_pytorch", None)
+    with pytest.raises(learned.Absent) as absent:
+        learned.st_lpips()
+    assert absent.value.reason == "package absent"
 
 
 def test_weights_are_found_and_others_refused(offline):
