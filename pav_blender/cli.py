@@ -27,7 +27,7 @@ VERBS = {
     "export": "a collection in INSTA's or VHAP's layout, or as posed meshes",
     "head": "a head file out of any Blender mesh with shape keys",
     "scene": "build a Blender scene of an avatar on a track",
-    "bench": "measure speed against error: render, train, kernels, scale, matte, track",
+    "bench": "measure speed against error: render, accuracy, train, kernels, scale, matte, track",
     "info": "what an avatar file holds",
     "doctor": "what this machine offers: packages, versions, threads",
 }

@@ -8,7 +8,9 @@ from typing import Any
 
 from ..core.progress import Progress
 
-SUMMARY = "Write a collection in another tool's layout, or its posed meshes; an avatar in half the size."
+SUMMARY = (
+    "Write a collection in another tool's layout, or its posed meshes; an avatar in half the size."
+)
 EXAMPLE = "pav export out/collection --to insta --out out/insta"
 
 DATASETS = ("insta", "vhap")

@@ -60,8 +60,8 @@ def test_what_no_half_can_hold_stays_whole(toy_avatar_path, tmp_path):
     assert kinds["field.latent"] == torch.float32
     assert kinds["field.tables"] == torch.float16
     again = Avatar.load(tmp_path / "large.pav")
-    assert float(again.field.latent[0, 0, 0]) == 65504.5
-    assert float(again.field.tables[0, 0]) == -65504.0
+    assert again.field.latent[0, 0, 0].item() == 65504.5
+    assert again.field.tables[0, 0].item() == -65504.0
 
 
 def test_saving_again_writes_whole_numbers(half_path, tmp_path):
@@ -82,7 +82,7 @@ def test_other_kinds_of_numbers_are_refused(toy_avatar_path, tmp_path):
         Avatar.load(path)
 
 
-@pytest.mark.parametrize("source,out", [("toy", "small.pav"), ("a.pav", "small")])
+@pytest.mark.parametrize(("source", "out"), [("toy", "small.pav"), ("a.pav", "small")])
 def test_only_avatar_files_are_halved(source, out, tmp_path, capsys):
     arguments = ["export", str(tmp_path / source), "--to", "half", "--out", str(tmp_path / out)]
     assert main(arguments) == 2

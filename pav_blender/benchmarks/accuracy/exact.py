@@ -18,7 +18,7 @@ from ...core.deformation.frames import vertex_maps
 from ...core.deformation.rigid import stance
 from ...core.field.avatar import Avatar
 from ...core.field.field import Field, Samples, Worn, condition
-from ...core.kernels import reference
+from ...core.kernels import cpu, reference
 from ...core.kernels.structures import Clearance, PosedMesh
 from ...core.rendering.rays import TILE, RayBatch, camera_rays
 from ...core.rendering.wearing import deformer_of, space_of
@@ -60,8 +60,7 @@ class Exact:
         those that lie in no filled cell, or too far from the mesh, are left out."""
         origins, directions = rays.origins.double(), rays.directions.double()
         points = origins[ray] + t[:, None] * directions[ray]
-        search = kernels.select("cpu").nearest.nearest
-        triangle = search(self.posed.search, points.float())[0]
+        triangle = cpu.nearest.nearest(self.posed.search, points.float())[0]
         corners = self.mesh.vertices[self.mesh.triangles.long()[triangle.long()]]
         weights, squared = reference.nearest.closest_on_triangle(points, *corners.unbind(1))
         canonical = reference.marching.canonicalise(points, triangle, weights, self.mesh)
@@ -94,7 +93,7 @@ class Exact:
 
     def shown(self, rays: RayBatch, step: float) -> np.ndarray:
         """Colours of rays [R, 3] before white, float64: a sample every `step` metres."""
-        ops = kernels.select("cpu").marching
+        ops = cpu.marching
         half = torch.full((len(rays),), 0.5)
         around = ops.bounds(
             self.posed.vertices, self.avatar.config.reach, rays.origins, rays.directions
