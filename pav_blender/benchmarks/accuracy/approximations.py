@@ -96,11 +96,13 @@ def measure(
     name = avatar.appearances[frame.appearance]
     scene = pose_scene(avatar, frame.vertices, name, frame.expression)
     known: dict[RenderSettings, Picture] = {}
-    settings = dict.fromkeys(s for pair in _SWITCHES.values() for s in pair)
-    for each in settings:
-        known[each] = render_scene(scene, camera, each)
-    calls = {str(i): partial(render_scene, scene, camera, s) for i, s in enumerate(settings)}
-    seconds = dict(zip(settings, best(calls, repeats).values(), strict=True))
+
+    def take(settings: RenderSettings) -> None:
+        known[settings] = render_scene(scene, camera, settings)
+
+    used = dict.fromkeys(s for pair in _SWITCHES.values() for s in pair)
+    calls = {str(index): partial(take, each) for index, each in enumerate(used)}
+    seconds = dict(zip(used, best(calls, repeats).values(), strict=True))
     rows = []
     for what, (on, off) in _SWITCHES.items():
         difference = differences(over(known[on].rgba, 1.0), over(known[off].rgba, 1.0))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import dataclasses
 import os
 from collections.abc import Iterator
@@ -24,7 +25,13 @@ from ...core.training.trainer import Trainer
 from .steps import differences
 
 _SIZE, _ITERATIONS = 128, 40
-_SMALL = {"log2_entries": 14, "levels": 8, "finest_resolution": 256, "rays": 1024}
+_SMALL = {
+    "log2_entries": 14,
+    "levels": 8,
+    "finest_resolution": 256,
+    "rays": 1024,
+    "occupancy_resolution": 64,
+}
 
 
 @contextlib.contextmanager
@@ -48,7 +55,9 @@ def measure(
     pictures = [_picture(avatar, frame, threads, 1 << 13) for threads in (1, 2, 2)]
     pictures.append(_picture(avatar, frame, 2, 1 << 10))
     frames = load_training_frames(collection)
-    trained = [_trained(collection, frames, threads, iterations) for threads in (1, 1, 2, 2)]
+    config = dataclasses.replace(Config(), iterations=iterations, **_SMALL)  # type: ignore[arg-type]
+    new = new_avatar(collection, frames, config)
+    trained = [_trained(new, frames, threads) for threads in (1, 1, 2, 2)]
     rows = [
         _row("picture: two threads, again", pictures[1], pictures[2]),
         _row("picture: one thread and two", pictures[0], pictures[1]),
@@ -83,13 +92,10 @@ def _picture(avatar: Avatar, frame: Frame, threads: int, chunk: int) -> tuple[np
     return found.rgba, np.where(np.isfinite(found.depth), found.depth, 0)
 
 
-def _trained(
-    collection: Collection, frames: list[Frame], threads: int, iterations: int
-) -> tuple[np.ndarray, ...]:
+def _trained(new: Avatar, frames: list[Frame], threads: int) -> tuple[np.ndarray, ...]:
     """A picture of a short training, and all its numbers."""
-    config = dataclasses.replace(Config(), iterations=iterations, **_SMALL)  # type: ignore[arg-type]
+    avatar = copy.deepcopy(new)
     with on_threads(threads):
-        avatar = new_avatar(collection, frames, config)
         trainer = Trainer(avatar, frames)
         while trainer.done < 1:
             with torch_alone():
