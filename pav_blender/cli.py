@@ -29,7 +29,7 @@ VERBS = {
     "scene": "build a Blender scene of an avatar on a track",
     "table": "reproduce a table of the paper: ablation, comparison, efficiency",
     "eval": "measure an avatar on frames it has not seen, with the field's metrics",
-    "bench": "measure speed against error: render, train, kernels, scale, matte, track",
+    "bench": "measure speed against error: render, accuracy, train, kernels, scale, matte, track",
     "info": "what an avatar file holds",
     "doctor": "what this machine offers: packages, versions, threads",
 }

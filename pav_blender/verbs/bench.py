@@ -13,7 +13,18 @@ from ..studio import DEFAULT_COLLECTION
 SUMMARY = "Measure speed against error on a studio avatar; tables, plots and claims."
 EXAMPLE = "pav bench render --out out/bench --check"
 
-NAMES = ("render", "train", "kernels", "scale", "memory", "devices", "matte", "track", "viewport")
+NAMES = (
+    "render",
+    "accuracy",
+    "train",
+    "kernels",
+    "scale",
+    "memory",
+    "devices",
+    "matte",
+    "track",
+    "viewport",
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -22,6 +22,7 @@ from .field import Field
 FORMAT = "pav-avatar"
 VERSION = 2
 _LARGEST_HEADER = 100 << 20
+_LARGEST_HALF = float(torch.finfo(torch.float16).max)
 
 
 @dataclass(eq=False)
@@ -109,9 +110,15 @@ class Avatar:
             )
         return self.appearances.index(name)
 
-    def save(self, path: Path | str) -> None:
-        """Writes the `.pav` file, whole or not at all."""
+    def save(self, path: Path | str, *, half: bool = False) -> None:
+        """Writes the `.pav` file, whole or not at all.
+
+        half: tables, features and networks in two bytes a number; those of a tensor that holds a
+        value beyond the largest of float16 stay in four.
+        """
         tensors = {f"field.{k}": v.contiguous() for k, v in self.field.state_dict().items()}
+        if half:
+            tensors = {k: _halved(v) for k, v in tensors.items()}
         arrays = {
             "mesh.canonical_vertices": self.canonical_vertices,
             "mesh.triangles": self.triangles,
@@ -153,6 +160,11 @@ class Avatar:
             raise InputError(f"{path}: {error}") from error
         except (safetensors.SafetensorError, KeyError, TypeError, ValueError, OSError) as error:
             raise InputError(f"{path}: a damaged avatar file ({error})") from error
+
+
+def _halved(values: torch.Tensor) -> torch.Tensor:
+    fits = values.numel() == 0 or float(values.abs().max()) <= _LARGEST_HALF
+    return values.to(torch.float16) if fits else values
 
 
 def head_of(avatar: Avatar) -> HeadModel:
@@ -206,6 +218,8 @@ def _check_weights(
             raise InputError(
                 f"the weights {name!r} are {shape}, the settings ask for {tuple(tensor.shape)}"
             )
+        if found.dtype not in (torch.float32, torch.float16):
+            raise InputError(f"the weights {name!r} are {found.dtype}, not float32 or float16")
 
 
 def _assemble(header: dict[str, Any], tensors: dict[str, torch.Tensor]) -> Avatar:
