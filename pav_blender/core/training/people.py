@@ -15,11 +15,12 @@ from pathlib import Path
 import numpy as np
 
 from ..collection import Collection, identity_distance, read_collection
-from ..collection.relative import OTHER_PERSON
 from ..collection.writer import check_name
 from ..errors import InputError
 from ..field.identities import appearance_name
 from .frames import Frame
+
+_SAME = 1e-4  # metres: two tracks of one person differ by more, two collections of one track don't
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +77,7 @@ class People:
 
 def read_people(folders: Mapping[str, Collection | Path | str]) -> People:
     """People by name, each a collection or its folder. InputError where they are fewer than two,
-    are not of one head model, or where two are one person."""
+    are not of one head model, or where two have the same face."""
     if len(folders) < 2:
         raise InputError("one avatar of several people needs two collections or more")
     collections = {
@@ -94,10 +95,10 @@ def read_people(folders: Mapping[str, Collection | Path | str]) -> People:
             )
         heads = [c.head.shaped(c.betas) for c in (first, second)]
         distance = identity_distance(first.head, *heads)
-        if distance <= OTHER_PERSON:
+        if distance <= _SAME:
             raise InputError(
-                f"{second.path}: {two!r} has the face of {one!r} within {1e3 * distance:.1f} mm: "
-                "clips of one person belong into one collection"
+                f"{second.path}: {two!r} has just the face of {one!r}: clips of one person belong "
+                "into one collection"
             )
     return People(collections)
 
