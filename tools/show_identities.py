@@ -1,4 +1,4 @@
-"""What several people in one avatar cost: each learned alone, and both together, on held-out frames.
+"""What several people in one avatar cost: each learned alone, and all together.
 
 Trains an avatar of each person, one of both with the same iterations (so half as many a person),
 and one of both with as many a person. Prints head PSNR of held-out frames, and writes a picture: a

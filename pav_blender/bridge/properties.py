@@ -124,6 +124,7 @@ class PavObject(bpy.types.PropertyGroup):
         description="Of an avatar of several people, whose head this is; it wears that person's "
         "appearances",
         override={"LIBRARY_OVERRIDABLE"},
+        update=_redraw,
     )
     appearance: bpy.props.EnumProperty(  # type: ignore[valid-type]
         name="Appearance",

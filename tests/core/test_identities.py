@@ -11,7 +11,6 @@ from toy import make_toy
 
 from pav_blender.cli import main
 from pav_blender.core.baking.bake import neutral_scene
-from pav_blender.core.collection import read_collection
 from pav_blender.core.errors import Cancelled, InputError, OtherPerson
 from pav_blender.core.evaluation.heldout import held_out, score
 from pav_blender.core.evaluation.report import measure
@@ -52,7 +51,7 @@ def people(folders):
 @pytest.fixture(scope="module")
 def path(people, small_config, tmp_path_factory):
     made = tmp_path_factory.mktemp("two") / "two.pav"
-    train(people, made, dataclasses.replace(small_config, iterations=200))
+    train(people, made, dataclasses.replace(small_config, iterations=150))
     return made
 
 
@@ -127,13 +126,12 @@ def test_each_person_is_shown_with_the_own_look(avatar, people):
         assert own_appearances(avatar, collection) == IDENTITIES[name]
         scores = held_out(avatar, collection, per_appearance=1)
         assert [s.appearance for s in scores] == IDENTITIES[name]
+        stranger = {"anna": "ben", "ben": "anna"}[name]
         for own in scores:
             assert own.head_psnr > 17
-            for other in (set(NAMES) - set(IDENTITIES[name])) | set(IDENTITIES[name]):
-                painted = ("anna/plain", "ben/bushy"), ("anna/bushy", "ben/plain")
-                if not any({other, own.appearance} <= set(pair) for pair in painted):
-                    worn = score(avatar, own.frame, other, RenderSettings())
-                    assert worn.head_psnr < own.head_psnr - 2, (own.appearance, other)
+            look = own.appearance.split("/")[1]
+            worn = score(avatar, own.frame, f"{stranger}/{look}", RenderSettings())
+            assert worn.head_psnr < own.head_psnr - 2
 
 
 def test_a_persons_frames_are_measured_in_that_persons_appearances(avatar, people):
@@ -273,11 +271,11 @@ def test_betas_or_offsets_that_are_not_a_row_a_person_are_told(avatar, tmp_path,
 
 
 def test_a_stopped_training_of_several_goes_on_and_not_with_others(people, small_config, tmp_path):
-    config = dataclasses.replace(small_config, iterations=6)
+    config = dataclasses.replace(small_config, iterations=3, rays=256)
     whole = train(people, tmp_path / "whole.pav", config)
     calls = iter(range(100))
     with pytest.raises(Cancelled, match="--resume"):
-        train(people, tmp_path / "b.pav", config, should_stop=lambda: next(calls) == 2)
+        train(people, tmp_path / "b.pav", config, should_stop=lambda: next(calls) == 1)
     swapped = read_people(dict(reversed(people.collections.items())))
     assert len({fingerprint(source) for source in (people, swapped, people.first)}) == 3
     with pytest.raises(InputError, match="another collection"):
