@@ -35,11 +35,22 @@ def grown(head, vertices: np.ndarray, which: int) -> np.ndarray:
     return out
 
 
-def make_toy(path: Path, *, frames: int = 8, size: int = 64, seed: int = 0) -> Path:
-    """Writes two clips of `frames` frames (the last two held out) and returns `path`."""
+def make_toy(
+    path: Path,
+    *,
+    frames: int = 8,
+    size: int = 64,
+    seed: int = 0,
+    betas: tuple[float, ...] = (0, 0, 0, 0),
+    painted: tuple[int, int] = (0, 1),
+) -> Path:
+    """Writes two clips of `frames` frames (the last two held out) and returns `path`.
+
+    betas: whose head it is; painted: which look (`paint`) each appearance has.
+    """
     random = np.random.default_rng(seed)
     head = builtin_head()
-    betas = np.zeros(4, np.float32)
+    betas = np.array(betas, np.float32)
     centre = head.shaped(betas)[head.regions["face"]].mean(0)
     camera_to_world = np.eye(4)
     camera_to_world[:3, :3] = np.diag([1, -1, -1])
@@ -48,7 +59,7 @@ def make_toy(path: Path, *, frames: int = 8, size: int = 64, seed: int = 0) -> P
     intrinsics = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
     camera = Camera(size, size, intrinsics, camera_to_world)
     with CollectionWriter(path, "builtin", betas) as writer:
-        for which, name in enumerate(APPEARANCES):
+        for which, name in zip(painted, APPEARANCES, strict=True):
             pose = np.zeros((frames, len(head.joint_names), 3), np.float32)
             pose[:, 1, 1] = np.linspace(-0.5, 0.5, frames)
             pose[:, 1, 0] = random.uniform(-0.1, 0.1, frames)

@@ -23,6 +23,7 @@ from pav_blender.core.errors import InputError, PavError
 from pav_blender.core.evaluation.metrics import over
 from pav_blender.core.evaluation.sheet import grid
 from pav_blender.core.field.avatar import Avatar, head_of
+from pav_blender.core.field.identities import identity
 from pav_blender.core.head.areas import area
 from pav_blender.core.images import write_rgba
 from pav_blender.core.rendering.cameras import Camera
@@ -55,7 +56,8 @@ def show(args: argparse.Namespace) -> np.ndarray:
         raise InputError(f"{args.avatar}: three appearances are needed")
     collection, clip = parse_track(args.track)
     row = parse_frames(args.frame, clip)[:1]
-    posed = posed_avatar(avatar, collection, clip, row)[0]
+    who = identity(avatar, avatar.appearances[0])
+    posed = posed_avatar(who, collection, clip, row)[0]
     camera = Camera(clip.width, clip.height, clip.intrinsics[row[0]], clip.camera_to_world[row[0]])
     camera = camera.resized(args.size, args.size)
 
@@ -73,8 +75,8 @@ def show(args: argparse.Namespace) -> np.ndarray:
             spent.append(time.perf_counter() - begun)
         return min(spent)
 
-    head = head_of(avatar)
-    rest = head.shaped(avatar.betas)
+    head = head_of(avatar, avatar.appearances[0])
+    rest = head.shaped(who.betas)
     hair, beard, clothes = (area(name, rest, head.regions) for name in ("hair", "beard", "clothes"))
     a, b, c = avatar.appearances[:3]
     blends = [picture(a, Layer(b, weight, None)) for weight in (0.0, 0.25, 0.5, 0.75, 1.0)]

@@ -38,14 +38,14 @@ def render_blend(
         heads = avatars.heads_of(scene.objects)
         if not heads:
             raise InputError(f"{blend}: no object in it wears an avatar; see `pav scene`")
-        known = avatars.load(avatars.path_of(heads[0].pav)).appearances
-        names: list[str | None] = [*known] if appearance == "all" else [appearance]
+        known = [avatars.looks(avatars.path_of(head.pav), head.pav.identity) for head in heads]
+        names: list[str | None] = [*known[0]] if appearance == "all" else [appearance]
         written: list[Path] = []
         total = len(names) * (scene.frame_end - scene.frame_start + 1)
         for name in names:
             if name is not None:
-                for head in heads:
-                    wear_only(head, known, name)
+                for head, looks in zip(heads, known, strict=True):
+                    wear_only(head, looks, name)
             for frame in range(scene.frame_start, scene.frame_end + 1):
                 path = numbered(out.replace("{appearance}", name or "scene"), frame)
                 _render_frame(scene, frame, path)

@@ -113,6 +113,13 @@ def header(path: Path) -> dict[str, Any]:
     return _known("header", path, read_header)
 
 
+def looks(path: Path, person: str) -> list[str]:
+    """The appearances of an avatar file; where it is of several people and `person` is one of
+    them, that one's alone. InputError, one line."""
+    known = header(path)
+    return list(known.get("identities", {}).get(person, known["appearances"]))
+
+
 def content(path: Path) -> str:
     """A hash of an avatar file, the same wherever it lies; read again only when it changed.
     InputError, one line."""

@@ -104,6 +104,7 @@ def other_appearances(head: Any) -> list[str]:
     """Appearances of a head's avatar that neither it nor a layer wears yet; all others than its own
     where each is worn."""
     path = avatars.path_of(head.pav)
-    names = [name for name in avatars.header(path)["appearances"] if name != head.pav.appearance]
+    known = avatars.looks(path, head.pav.identity)
+    names = [name for name in known if name != head.pav.appearance]
     worn_already = {layer.appearance for layer in head.pav.layers}
     return [name for name in names if name not in worn_already] or names

@@ -32,7 +32,7 @@ def appearance_items(self: Any, _context: Any) -> list[tuple[str, str, str, int,
     head = self.id_data.pav  # self may be one of its layers
     try:
         path = avatars.path_of(head) if head.avatar else None
-        names = tuple(avatars.header(path)["appearances"]) if path else ()
+        names = tuple(avatars.looks(path, head.identity)) if path else ()
     except (PavError, ImportError):
         path, names = None, ()
     icons = tuple(thumbnails.icons(path, names)) if path else ()
@@ -118,6 +118,13 @@ class PavObject(bpy.types.PropertyGroup):
         options=_RELATIVE,
         override={"LIBRARY_OVERRIDABLE"},
         update=_avatar_chosen,
+    )
+    identity: bpy.props.StringProperty(  # type: ignore[valid-type]
+        name="Identity",
+        description="Of an avatar of several people, whose head this is; it wears that person's "
+        "appearances",
+        override={"LIBRARY_OVERRIDABLE"},
+        update=_redraw,
     )
     appearance: bpy.props.EnumProperty(  # type: ignore[valid-type]
         name="Appearance",

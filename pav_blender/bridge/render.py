@@ -86,6 +86,16 @@ def check_topology(actor: Actor, avatar: Any) -> None:
         )
 
 
+def check_person(actor: Actor, avatar: Any) -> None:
+    """InputError where a head wears the appearance of another person than whose it is."""
+    for name in (actor.appearance, *(layer.appearance for layer in actor.layers)):
+        if name in avatar.appearances and name not in actor.looks:
+            raise InputError(
+                f"object {actor.name!r} is the head of {actor.identity!r} and can't wear {name!r}; "
+                f"that person's head is added by importing {actor.avatar} with that appearance"
+            )
+
+
 class Posed:
     """Poses of the last actors, and the last solids: while only the camera moves, or a head as a
     whole, nothing is posed anew. One picture at a time."""
@@ -108,10 +118,11 @@ class Posed:
                 self._scenes.append(entry)
                 return scene
         check_topology(actor, avatar)
+        check_person(actor, avatar)
         scene = pose_scene(
             avatar,
             actor.vertices,
-            worn(actor.appearance or avatar.appearances[0], actor.layers),
+            worn(actor.appearance or actor.looks[0], actor.layers),
             expression_vector(actor, avatar.expression_names),
         )
         self._scenes = [*self._scenes, (actor, scene)][-self._kept :] if self._kept else []

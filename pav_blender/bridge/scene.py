@@ -30,11 +30,14 @@ class SceneObjects:
 def build_head(avatar_path: Path, appearance: str | None = None) -> Any:
     """Adds the head of an avatar to the current scene, at rest: a `rig.Rig` with its properties.
 
-    InputError where the avatar, its head model or the appearance is wrong.
+    Of an avatar of several people it is the head of the one whose the appearance is, for good: it
+    wears that person's appearances alone. InputError where the avatar, its head model or the
+    appearance is wrong.
     """
     import bpy
 
     from ..core.field.avatar import head_of
+    from ..core.field.identities import identity
     from . import avatars
     from .rig import build_rig
 
@@ -42,12 +45,14 @@ def build_head(avatar_path: Path, appearance: str | None = None) -> Any:
     name = avatar.appearances[0] if appearance is None else appearance
     check_appearance(avatar.appearances, name)  # told before anything is built
     try:
-        head = head_of(avatar)
+        head = head_of(avatar, name)
     except InputError as error:
         raise InputError(f"{avatar_path}: {error}") from error
     if head.expression_names != avatar.expression_names:  # another version's names for the same
         head = replace(head, expression_names=avatar.expression_names)
-    rig = build_rig(head, avatar.betas, avatar_path.stem, bpy.context.scene.collection)
+    who = identity(avatar, name)
+    rig = build_rig(head, who.betas, avatar_path.stem, bpy.context.scene.collection)
+    rig.mesh.pav.identity = who.name
     rig.mesh.pav.avatar = stored_path(avatar_path, bpy.data.filepath)
     choose_appearance(rig.mesh, avatar.appearances, name)
     return rig
@@ -150,12 +155,15 @@ def import_track(
 def check_person(mesh: Any, collection: Any) -> None:
     """InputError where a collection was tracked on another person than a head object's avatar, or
     on another head model."""
+    from ..core.field.identities import identity
     from ..core.rendering.sequence import check_head, check_identity
     from . import avatars
 
-    avatar = avatars.load(avatars.path_of(mesh.pav))
+    path = avatars.path_of(mesh.pav)
+    avatar = avatars.load(path)
     check_head(avatar, collection)
-    check_identity(avatar, collection, 'tick "Another Person\'s Track" (confirm_identity)')
+    who = identity(avatar, avatars.looks(path, mesh.pav.identity)[0])
+    check_identity(who, collection, 'tick "Another Person\'s Track" (confirm_identity)')
 
 
 def use_engine(scene: Any) -> None:
@@ -185,13 +193,16 @@ def build_scene(
     the clip is another person's, unless `other_identity` says that this is meant."""
     import bpy
 
+    from ..core.field.identities import identity
     from ..core.rendering.sequence import check_head, check_identity
     from . import avatars
 
     avatar = avatars.load(avatar_path)
     check_head(avatar, collection)
+    name = avatar.appearances[0] if appearance is None else appearance
+    who = identity(avatar, name)
     if not other_identity:
-        check_identity(avatar, collection)
+        check_identity(who, collection)
     collection.clip(clip_name)  # a wrong name is told before anything is built
     rig = build_head(avatar_path, appearance)
     camera = import_track(rig.mesh, collection, clip_name, fps, relative=relative)

@@ -15,7 +15,7 @@ from ..core.errors import Cancelled, InputError, PavError
 from ..core.frame_files import damage
 from ..core.rendering.colour import linear_to_srgb
 from ..core.rendering.frames import FORMATS, Format, provenance, write_frame
-from . import avatars, requirements, turns
+from . import requirements, turns
 from .render import Pixels
 from .reuse import digest, draw
 from .shot import Shot, find_actors, read_shot
@@ -146,7 +146,7 @@ def every_appearance(scene: Any) -> tuple[str, ...]:
     layer = scene.view_layers[0]
     layer.update()
     actors = find_actors(layer.depsgraph)
-    known = [avatars.header(actor.avatar)["appearances"] for actor in actors]
+    known = [actor.looks for actor in actors]
     shared = tuple(n for n in known[0] if all(n in names for names in known)) if known else ()
     if not shared:
         raise InputError(
@@ -154,7 +154,8 @@ def every_appearance(scene: Any) -> tuple[str, ...]:
             "in the scene"
         )
     for name in shared:
-        if set('/\\:*?"<>|\0') & set(name) or name.startswith("."):
+        parts = name.split("/")  # "person/look" is a folder in a folder
+        if set('\\:*?"<>|\0') & set(name) or not all(p and p[0] != "." for p in parts):
             raise InputError(f"appearance {name!r} cannot name a folder; write it by itself")
     return shared
 
@@ -169,7 +170,7 @@ def wearing(shot: Shot, appearance: str | None) -> Shot:
 
 def worn_names(actor: Any) -> str:
     """What an actor wears, in words: its appearance, and layers with their weights."""
-    base = str(actor.appearance or avatars.header(actor.avatar)["appearances"][0])
+    base = str(actor.appearance or actor.looks[0])
     return " + ".join([base, *(f"{layer.appearance} {layer.weight:g}" for layer in actor.layers)])
 
 

@@ -23,7 +23,7 @@ class Actor:
     """A head to draw. vertices [V, 3] float32 metres in the head's own space, which `rigid` and
     `scale` place in the world (see `mesh.placement`); expression: shape key values by name;
     triangles [T, 3] for the check against the avatar; appearance None: the avatar's first; layers:
-    what is worn over it."""
+    what is worn over it; identity: whose head it is, "" where that is not known."""
 
     name: str
     avatar: Path
@@ -34,12 +34,18 @@ class Actor:
     rigid: np.ndarray
     scale: float
     layers: tuple[Layer, ...] = ()
+    identity: str = ""
+
+    @property
+    def looks(self) -> list[str]:
+        """The appearances that it can wear."""
+        return avatars.looks(self.avatar, self.identity)
 
     def equals(self, other: Actor, within: float = 0.0) -> bool:
         """Whether both would give the same picture; vertices may differ by `within` metres."""
         return (
-            (self.avatar, self.appearance, self.expression, self.scale)
-            == (other.avatar, other.appearance, other.expression, other.scale)
+            (self.avatar, self.appearance, self.expression, self.scale, self.identity)
+            == (other.avatar, other.appearance, other.expression, other.scale, other.identity)
             and np.array_equal(self.rigid, other.rigid)
             and self.vertices.shape == other.vertices.shape
             and np.allclose(self.vertices, other.vertices, rtol=0, atol=within)
@@ -183,6 +189,7 @@ def read_actor(evaluated: Any, matrix_world: Any, depsgraph: Any) -> Actor:
         rigid=rigid,
         scale=scale,
         layers=read_layers(evaluated),
+        identity=original.pav.identity,
     )
 
 
@@ -219,7 +226,7 @@ def _appearance(pav: Any, name: str) -> str | None:
     if pav.appearance:
         return pav.appearance
     path = avatars.path_of(pav)
-    known = ", ".join(avatars.header(path)["appearances"])
+    known = ", ".join(avatars.looks(path, pav.identity))
     raise InputError(
         f"object {name!r}: the appearance chosen there is not in {path}; it has {known}"
     )

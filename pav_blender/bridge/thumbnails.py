@@ -49,12 +49,13 @@ def draw(path: Path, name: str) -> np.ndarray:
     """An appearance from the front, at rest: straight sRGB [SIZE, SIZE, 4] float32, row 0 on top.
     PavError where the file cannot be read."""
     from ..core.field.avatar import head_of
+    from ..core.field.identities import identity
     from ..core.rendering.cameras import Camera
     from ..core.rendering.render import RenderSettings, render
 
     avatar = avatars.load(path)
     try:
-        points = head_of(avatar).shaped(avatar.betas)
+        points = head_of(avatar, name).shaped(identity(avatar, name).betas)
     except InputError:  # the head model is not at hand: as it was learned, the mouth open
         points = avatar.canonical_vertices
     weights = avatar.rigid_weights

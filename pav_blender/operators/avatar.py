@@ -25,12 +25,17 @@ class PAV_OT_add_head(ChoosesFile, bpy.types.Operator):
     filter_glob: bpy.props.StringProperty(  # type: ignore[valid-type]
         default="*.pav", options={"HIDDEN"}
     )
+    appearance: bpy.props.StringProperty(  # type: ignore[valid-type]
+        name="Appearance",
+        description="What the head wears, and so whose head it is where the avatar is of several "
+        "people; the first if empty",
+    )
 
     @reporting
     def execute(self, context: Any) -> set[str]:
         requirements.check()
         object_mode(context)
-        rig = bridge_scene.build_head(Path(self.filepath))
+        rig = bridge_scene.build_head(Path(self.filepath), self.appearance or None)
         select(context, rig.mesh)
         bridge_scene.use_engine(context.scene)
         return {"FINISHED"}

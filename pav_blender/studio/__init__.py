@@ -33,6 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The arguments of `pav studio`."""
     parser.add_argument("out", type=Path, metavar="OUT", help="folder of the new collection")
     parser.add_argument("--appearances", type=int, default=3, help="clips, one a look (1-5)")
+    parser.add_argument("--first", type=int, default=1, help="number of the first look (1)")
     parser.add_argument("--frames", type=int, default=60, help="pictures a clip")
     parser.add_argument("--size", type=int, default=256, help="pixels a side")
     parser.add_argument("--seed", type=int, default=0, help="who it is and what they do")
@@ -68,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
     render_collection(
         args.out, appearances=args.appearances, frames=args.frames, size=args.size,
         seed=args.seed, performance=args.performance, truth=args.truth, overwrite=args.overwrite,
-        progress=progress,
+        progress=progress, first=args.first,
     )  # fmt: skip
     print(args.out)
     return 0

@@ -52,20 +52,21 @@ class Picture:
 def render_collection(
     out: Path, *, appearances: int = 3, frames: int = 60, size: int = 256, seed: int = 0,
     performance: int = 0, views=VIEWS, truth: str = "full", progress: Progress | None = None,
-    overwrite: bool = False, samples: int | None = None,
+    overwrite: bool = False, samples: int | None = None, first: int = 1,
 ) -> Path:  # fmt: skip
     """Render `appearances` clips of `frames` pictures of `size` x `size` and write a collection.
 
+    `first` is the number of the first look, from 1: another person may have others.
     `views` are orbit angles in degrees of held-out cameras, one extra picture a clip each. `truth`
     "full" adds the posed vertices and depth to the parameters, labels and mattes. `performance`
     numbers what the person does, before which camera: the same person in the same looks is filmed
     doing other things. `progress` gets (fraction done, what). The result depends on the arguments
     only. Raises InputError.
     """
-    _check(appearances, frames, size, performance, truth)
+    _check(appearances, frames, size, performance, truth, first)
     head = builtin_head()
     person = build_person(head, identity(head, seed))
-    looks = APPEARANCES[:appearances]
+    looks = APPEARANCES[first - 1 :][:appearances]
     total, done = appearances * (frames + len(views)), 0
     extra = {
         "made_by": "pav studio", "seed": seed, "frames": frames, "truth": truth,
@@ -88,23 +89,30 @@ def render_collection(
                     if progress:
                         progress(done / total, f"{look.name} {shot.frame_id}")
             writer.clip(_clip(look, shots, size, vertices))
-        note = _note(appearances, frames, size, (seed, performance), truth, len(views))
+        note = _note(appearances, frames, size, (seed, performance), truth, len(views), first)
         write_text(writer.root / "README.md", note)
     return Path(out)
 
 
 def _note(
-    appearances: int, frames: int, size: int, seeds: tuple[int, int], truth: str, views: int
+    appearances: int,
+    frames: int,
+    size: int,
+    seeds: tuple[int, int],
+    truth: str,
+    views: int,
+    first: int,
 ) -> str:
     """What the folder is, how it was made, and whose it is."""
     seed, performance = seeds
     other = f" --performance {performance}" if performance else ""
+    begun = "" if first == 1 else f" --first {first}"
     return f"""# A synthetic person in {appearances} appearances
 
 Made by one command; nobody was filmed:
 
     pav studio THIS_FOLDER --appearances {appearances} --frames {frames} --size {size} \\
-        --seed {seed}{other} --truth {truth}
+        --seed {seed}{other} --truth {truth}{begun}
 
 One clip an appearance: {frames} frames of one performance (the last sixth is held out: split
 "test") and {views} pictures from cameras that no clip used (split "view"). Cycles renders the
@@ -116,9 +124,12 @@ Licence: CC0 1.0 (public domain), https://creativecommons.org/publicdomain/zero/
 """
 
 
-def _check(appearances: int, frames: int, size: int, performance: int, truth: str) -> None:
+def _check(
+    appearances: int, frames: int, size: int, performance: int, truth: str, first: int
+) -> None:
     for what, value, low, high in (
-        ("appearances", appearances, 1, len(APPEARANCES)),
+        ("first", first, 1, len(APPEARANCES)),
+        ("appearances", appearances, 1, len(APPEARANCES) + 1 - first),
         ("frames", frames, 2, 100_000),
         ("size", size, 32, 4096),
         ("performance", performance, 0, 100_000),

@@ -15,7 +15,14 @@ EXAMPLE = "pav train out/collection --out out/avatar.pav --minutes 5"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("collection", type=Path, help="folder of the collection")
+    parser.add_argument("collection", type=Path, nargs="?", help="folder of the collection")
+    parser.add_argument(
+        "--identities",
+        nargs="+",
+        metavar="NAME=FOLDER",
+        help="instead: two people or more, a collection each, for one avatar of them all (NAME: "
+        "the folder's own if left out); their appearances are called NAME/LOOK",
+    )
     parser.add_argument("--out", type=Path, required=True, help="avatar file to write (.pav)")
     parser.add_argument("--minutes", type=float, help="plan for this long")
     parser.add_argument("--iterations", type=int, help="or for so many iterations (15000)")
@@ -53,14 +60,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     from ..core.config import Config
     from ..core.devices import device_of
+    from ..core.errors import InputError
+    from ..core.training.people import parse_people, read_people
     from ..core.training.train import train
 
+    if (args.collection is None) == (args.identities is None):
+        raise InputError(
+            "a collection is needed, or --identities with a collection of each of several people"
+        )
     changes = {"seed": args.seed, "refine_poses": args.refine_poses}
     if args.iterations is not None:
         changes["iterations"] = args.iterations
     config = dataclasses.replace(Config.preset(args.preset), **changes)
     avatar = train(
-        args.collection,
+        read_people(parse_people(args.identities)) if args.identities else args.collection,
         args.out,
         config,
         minutes=args.minutes,

@@ -9,6 +9,7 @@ import torch
 
 from ..errors import InputError
 from ..field.avatar import Avatar, head_of
+from ..field.identities import identity
 from ..head.geometry import vertex_normals
 from ..progress import Report
 from ..rendering.render import Scene, pose_scene
@@ -32,7 +33,8 @@ class Baked:
 
 def neutral_scene(avatar: Avatar, appearance: str) -> Scene:
     """The avatar at rest, its mouth closed, wearing an appearance."""
-    vertices = head_of(avatar).shaped(avatar.betas)
+    who = identity(avatar, appearance)
+    vertices = head_of(avatar, appearance).shaped(who.betas)
     with torch.inference_mode():
         return pose_scene(avatar, vertices, appearance)
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..collection import Clip, Collection
 from ..field.avatar import Avatar
+from ..field.identities import own_appearances
 from ..progress import Report
 from ..rendering.render import RenderSettings, render
 from ..training.frames import Frame, load_frames
@@ -74,12 +75,14 @@ def held_out(
     settings: RenderSettings | None = None,
     progress: Report | None = None,
 ) -> list[Score]:
-    """Scores of held-out frames, at most `per_appearance` each, spread over the clip."""
+    """Scores of held-out frames, at most `per_appearance` each, spread over the clip; the
+    collection's person must be one that the avatar learned."""
     settings = settings or RenderSettings()
     frames = chosen_frames(collection, splits, per_appearance)
+    names = own_appearances(avatar, collection)
     scores = []
     for done, frame in enumerate(frames):
-        scores.append(score(avatar, frame, avatar.appearances[frame.appearance], settings))
+        scores.append(score(avatar, frame, names[frame.appearance], settings))
         if progress:
             progress((done + 1) / len(frames), frame=frame.name, psnr=scores[-1].psnr)
     return scores

@@ -14,6 +14,7 @@ import numpy as np
 
 from ..collection import Collection
 from ..field.avatar import Avatar
+from ..field.identities import own_appearances
 from ..files import write_text
 from ..progress import Report
 from ..rendering.render import RenderSettings
@@ -59,9 +60,9 @@ def measure(
     splits: tuple[str, ...] = ("test",),
     progress: Report | None = None,
 ) -> Measured:
-    """Renders held-out frames with their own appearance and with each of the others."""
+    """Renders held-out frames with their own appearance and with each of that person's others."""
     frames = chosen_frames(collection, splits, per_appearance)
-    names = avatar.appearances
+    names = own_appearances(avatar, collection)
     scores: dict[str, dict[str, list[Score]]] = {n: {m: [] for m in names} for n in names}
     settings = RenderSettings()
     total = len(frames) * len(names)

@@ -18,6 +18,7 @@ from ..errors import InputError
 from ..files import replacing
 from ..head import HeadModel, load_head
 from .field import Field
+from .identities import check_shapes, identity, read_identities
 
 FORMAT = "pav-avatar"
 VERSION = 2
@@ -33,7 +34,8 @@ class Avatar:
     rigid_weights [V], how much a vertex says where the head's own axes are; box_min [3] and
     box_size: the cube of canonical space, metres, that the field fills; occupied
     [A, G, G, G] bool: its cells that are not empty, an appearance. The mask is part of the model:
-    outside it nothing was trained.
+    outside it nothing was trained. Of several people (`identities`: each one's appearances; none
+    where there is but one person) betas are [P, B] and head_offset [P, V, 3]: see `.identities`.
     """
 
     config: Config
@@ -53,6 +55,7 @@ class Avatar:
     expression_names: tuple[str, ...]
     record: dict[str, Any] = field(default_factory=dict)
     head_offset: np.ndarray | None = None  # [V, 3] metres, the person's own beside the betas
+    identities: dict[str, list[str]] = field(default_factory=dict)
 
     @classmethod
     def create(
@@ -79,6 +82,7 @@ class Avatar:
             torch.from_numpy(np.array(triangles, np.int32, order="C")),
             corner_uvs,
             len(canonical_vertices),
+            len(rest.get("identities", ())),
         )
         if "occupied" not in rest:
             rest["occupied"] = np.ones((len(appearances), *cells), bool)
@@ -144,6 +148,8 @@ class Avatar:
             "colour_space": "sRGB",
             "record": self.record,
         }
+        if self.identities:
+            header["identities"] = self.identities
         with replacing(path) as temporary:
             safetensors.torch.save_file(tensors, temporary, {"pav": json.dumps(header)})
 
@@ -167,10 +173,11 @@ def _halved(values: torch.Tensor) -> torch.Tensor:
     return values.to(torch.float16) if fits else values
 
 
-def head_of(avatar: Avatar) -> HeadModel:
-    """The head model that an avatar was trained on; InputError where it is another by now."""
-    head = load_head(avatar.head_name, avatar.head_fingerprint)
-    return head if avatar.head_offset is None else head.with_offset(avatar.head_offset)
+def head_of(avatar: Avatar, appearance: str | None = None) -> HeadModel:
+    """The head model that an avatar was trained on, with the offset of the person that an
+    appearance is of (None: there is but one). InputError where the model is another by now."""
+    who = identity(avatar, appearance)
+    return who.of(load_head(avatar.head_name, avatar.head_fingerprint))
 
 
 def read_header(path: Path | str) -> dict[str, Any]:
@@ -195,6 +202,10 @@ def read_header(path: Path | str) -> dict[str, Any]:
         raise InputError(
             f"{path}: avatar version {header.get('version')!r}; this program reads {VERSION}"
         )
+    try:
+        read_identities(header)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
     return header
 
 
@@ -210,6 +221,7 @@ def _check_weights(
             torch.zeros(1, 3, dtype=torch.int32),
             torch.zeros(1, 3, 2),
             vertices,
+            len(header.get("identities", ())),
         ).state_dict()
     for name, tensor in expected.items():
         found = tensors.get(f"field.{name}")
@@ -225,6 +237,7 @@ def _check_weights(
 def _assemble(header: dict[str, Any], tensors: dict[str, torch.Tensor]) -> Avatar:
     config = Config.from_json(header["config"])
     appearances = [str(name) for name in header["appearances"]]
+    identities = read_identities(header)
     for name, tensor in tensors.items():
         if tensor.is_floating_point() and not torch.isfinite(tensor).all():
             raise InputError(f"the values of {name!r} are not finite")
@@ -239,6 +252,9 @@ def _assemble(header: dict[str, Any], tensors: dict[str, torch.Tensor]) -> Avata
     packed = tensors["space.occupied"].numpy()
     if packed.shape != (len(appearances), -(-(cells**3) // 8)):
         raise InputError(f"the occupancy has shape {packed.shape}; {cells} cells a side expected")
+    betas = tensors["head.betas"].numpy()
+    offset = tensors["head.offset"].numpy() if "head.offset" in tensors else None
+    check_shapes(identities, betas, offset, len(vertices))
     bits = np.unpackbits(packed, axis=1, count=cells**3)
     avatar = Avatar.create(
         config,
@@ -254,19 +270,14 @@ def _assemble(header: dict[str, Any], tensors: dict[str, torch.Tensor]) -> Avata
         occupied=bits.astype(bool).reshape(len(appearances), cells, cells, cells),
         head_name=str(header["head"]["name"]),
         head_fingerprint=str(header["head"]["fingerprint"]),
-        betas=tensors["head.betas"].numpy(),
-        head_offset=_offset(tensors.get("head.offset"), len(vertices)),
+        betas=betas,
+        head_offset=offset,
+        identities=identities,
         record=dict(header["record"]),
     )
     state = {k[6:]: v for k, v in tensors.items() if k.startswith("field.")}
     avatar.field.load_state_dict(state)
     return avatar
-
-
-def _offset(tensor: torch.Tensor | None, vertices: int) -> np.ndarray | None:
-    if tensor is not None and tuple(tensor.shape) != (vertices, 3):
-        raise InputError(f"the head's offset is {tuple(tensor.shape)}; {(vertices, 3)} expected")
-    return None if tensor is None else tensor.numpy()
 
 
 def _check_indices(name: str, array: np.ndarray, limit: int) -> None:

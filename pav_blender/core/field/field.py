@@ -59,12 +59,18 @@ TURN = 3
 
 
 def condition(
-    config: Config, expression: np.ndarray | torch.Tensor, turn: np.ndarray
+    config: Config,
+    expression: np.ndarray | torch.Tensor,
+    turn: np.ndarray,
+    person: torch.Tensor | None = None,
 ) -> torch.Tensor:
     """What the density depends on besides the place: of the expression [E] and the head's turn [3]
-    (`deformation.rigid.Stance`) what the settings let it see."""
+    (`deformation.rigid.Stance`) what the settings let it see; person: of several, whose head it is
+    (`identities.code`)."""
     seen = torch.as_tensor(expression).float() if config.sees_expression else torch.empty(0)
-    return torch.cat([seen, torch.from_numpy(turn)]) if config.sees_turn else seen
+    if config.sees_turn:
+        seen = torch.cat([seen, torch.from_numpy(turn)])
+    return seen if person is None else torch.cat([seen, person])
 
 
 @dataclass
@@ -111,7 +117,7 @@ class Field(nn.Module):
     """The networks and tables of one avatar; its `state_dict` is what a `.pav` holds.
 
     triangles [T, 3] int32 and corner_uvs [T, 3, 2] (UV at each triangle's corners) are the mesh's
-    and not learned.
+    and not learned. people: how many identities it tells apart, 0 for one.
     """
 
     triangles: torch.Tensor
@@ -125,6 +131,7 @@ class Field(nn.Module):
         triangles: torch.Tensor,
         corner_uvs: torch.Tensor,
         vertices: int,
+        people: int = 0,
     ) -> None:
         super().__init__()
         self.config = config
@@ -164,7 +171,7 @@ class Field(nn.Module):
         codes = config.latent_channels if config.appearance_code and mapped else 0
         self.code = nn.Parameter(_normal(torch.empty(appearances, codes), 0.5))
         embedding, geometry = config.embedding_channels, config.geometry_channels
-        conditions = config.sees_expression * expressions + config.sees_turn * TURN
+        conditions = config.sees_expression * expressions + config.sees_turn * TURN + people
         self.density = Mlp(
             self.encoded_width, conditions, config.hidden, config.density_layers, geometry
         )

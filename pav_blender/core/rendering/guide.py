@@ -13,10 +13,13 @@ from ..field.field import Samples, Worn, condition
 _TURNS = ((0.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, -0.5, 0.0), (0.3, 0.0, 0.0))
 
 
-def guide(avatar: Avatar, deformer: Deformer, worn: Worn, occupied: np.ndarray) -> torch.Tensor:
+def guide(
+    avatar: Avatar, deformer: Deformer, worn: Worn, person: torch.Tensor, occupied: np.ndarray
+) -> torch.Tensor:
     """The greatest density (1/m) found in each cell [G, G, G] or one beside it, for the only
-    appearance in `worn`; 0 where nothing is `occupied`. Neighbours count since a voxel lies in
-    several cells: without them surfaces were stepped over."""
+    appearance in `worn`, on the head of `person` (`identities.code`); 0 where nothing is
+    `occupied`. Neighbours count since a voxel lies in several cells: without them surfaces were
+    stepped over."""
     count = occupied.shape[0]
     cells = torch.from_numpy(np.argwhere(occupied).astype(np.float32))
     mesh = deformer.pose(avatar.canonical_vertices)
@@ -28,9 +31,10 @@ def guide(avatar: Avatar, deformer: Deformer, worn: Worn, occupied: np.ndarray) 
         triangle, barycentric, distance = deformer.nearest(mesh, points)
         still = np.zeros(len(avatar.expression_names), np.float32)
         zeros = torch.zeros(len(cells), dtype=torch.int32)
+        seen = condition(avatar.config, still, np.array(turn, np.float32), person)
         samples = Samples(
             unit, unit, triangle, barycentric, distance, zeros, zeros, zeros,
-            condition(avatar.config, still, np.array(turn, np.float32))[None], torch.zeros(1, 3),
+            seen[None], torch.zeros(1, 3),
         )  # fmt: skip
         density = avatar.field.geometry(samples.to(avatar.field.device), worn)[0]
         found = torch.maximum(found, density.cpu())

@@ -136,7 +136,7 @@ def pose_scene(
     stands = stance(avatar.canonical_vertices, vertices, avatar.rigid_weights)
     mesh = deformer_of(avatar).pose(vertices)
     filled = voxels(mesh, wearing.space, avatar.config.reach)
-    seen = condition(avatar.config, values.astype(np.float32), stands.turn)
+    seen = condition(avatar.config, values.astype(np.float32), stands.turn, wearing.person)
     return Scene(avatar, mesh, filled, stands, seen, wearing)
 
 

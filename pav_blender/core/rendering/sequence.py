@@ -13,6 +13,7 @@ from ..collection.relative import OTHER_PERSON
 from ..devices import device_of
 from ..errors import InputError, OtherPerson
 from ..field.avatar import Avatar
+from ..field.identities import Identity, identity
 from ..progress import Report
 from .cameras import Camera
 from .frames import format_of, provenance, write_frame
@@ -77,29 +78,28 @@ def check_head(avatar: Avatar, collection: Collection) -> None:
 
 
 def check_identity(
-    avatar: Avatar, collection: Collection, advice: str = "add --other-identity"
+    who: Identity, collection: Collection, advice: str = "add --other-identity"
 ) -> None:
-    """OtherPerson where the track is another person's; `advice`: how to drive with it anyway."""
-    own = collection.head_with(avatar.head_offset).shaped(avatar.betas)
-    distance = identity_distance(collection.head, own, collection.head.shaped(collection.betas))
+    """OtherPerson where the track is not that person's; `advice`: how to drive with it anyway."""
+    tracked = collection.head.shaped(collection.betas)
+    distance = identity_distance(collection.head, who.neutral(collection), tracked)
     if distance > OTHER_PERSON:
         raise OtherPerson(
             f"{collection.path}: tracked on another person, whose face is {1e3 * distance:.1f} mm "
-            f"off the avatar's (up to {1e3 * OTHER_PERSON:g} mm is one person): {advice} to drive "
-            "the avatar with it anyway, best relative to its neutral"
+            f"off {who.name or 'the avatar'}'s (up to {1e3 * OTHER_PERSON:g} mm is one person): "
+            f"{advice} to drive {who.name or 'the avatar'} with it anyway, best relative to its "
+            "neutral"
         )
 
 
-def posed_avatar(
-    avatar: Avatar, collection: Collection, clip: Clip, rows: np.ndarray
-) -> np.ndarray:
-    """The avatar's mesh moved as in rows of a clip, [len(rows), V, 3] float32 metres.
+def posed_avatar(who: Identity, collection: Collection, clip: Clip, rows: np.ndarray) -> np.ndarray:
+    """A person's mesh moved as in rows of a clip, [len(rows), V, 3] float32 metres.
 
-    The avatar keeps its own identity, so that another person's track drives without reshaping it;
-    what a clip's own vertices say beyond its parameters is added.
+    The person keeps the own identity, so that another's track drives without reshaping it; what a
+    clip's own vertices say beyond its parameters is added.
     """
     moved = clip.expression[rows], clip.pose[rows], clip.translation[rows]
-    posed = collection.head_with(avatar.head_offset).pose(avatar.betas, *moved).numpy()
+    posed = collection.head_with(who.head_offset).pose(who.betas, *moved).numpy()
     if clip.vertices is not None:
         posed += clip.vertices[rows] - collection.head.pose(collection.betas, *moved).numpy()
     return posed
@@ -125,7 +125,8 @@ def render_track(
     """Renders and writes one picture a frame; returns their paths.
 
     appearance: a name, a blend (`parse_appearance`), or "all" with {appearance} in `out`; format: a
-    name in `frames.FORMATS`, by default as `out` ends. The avatar's own identity poses the mesh.
+    name in `frames.FORMATS`, by default as `out` ends. The mesh is posed by the avatar's own
+    identity, that of the person whose appearance it is where there are several.
     relative: the motion from its neutral, see `relative_clip`; other_identity: another person's
     track is meant. Raises InputError before anything is written.
     """
@@ -134,19 +135,22 @@ def render_track(
     avatar.field.to(where)
     collection, clip = parse_track(track)
     check_head(avatar, collection)
-    if not other_identity:
-        check_identity(avatar, collection)
-    if relative:
-        clip = relative_clip(clip)
     names = avatar.appearances if appearance == "all" else [appearance]
     worn = {name: parse_appearance(name, avatar) for name in names}
+    of = {name: _whose(avatar, look) for name, look in worn.items()}
+    people = {who.name: who for who in of.values()}
+    for who in people.values():
+        if not other_identity:
+            check_identity(who, collection)
+    if relative:
+        clip = relative_clip(clip)
     rows = parse_frames(frames, clip)
     settings = RenderSettings.preset(quality)
     check_pattern(out, several=len(rows) > 1, appearances=len(names), depth=depth)
     kind = format_of(out, format)
     if size is not None and not 1 <= size <= 16384:
         raise InputError(f"--size {size}: from 1 to 16384")
-    posed = posed_avatar(avatar, collection, clip, rows)
+    posed = {who.name: posed_avatar(who, collection, clip, rows) for who in people.values()}
     written = []
     total = len(rows) * len(names)
     for name in names:
@@ -161,7 +165,7 @@ def render_track(
                 )
             picture = render(
                 avatar,
-                posed[at],
+                posed[of[name].name][at],
                 camera,
                 worn[name],
                 settings,
@@ -177,6 +181,11 @@ def render_track(
             if progress:
                 progress(len(written) / total, picture=str(path))
     return written
+
+
+def _whose(avatar: Avatar, appearance: Appearance) -> Identity:
+    """Whose head it is that wears something."""
+    return identity(avatar, avatar.appearances[shares_of(avatar, appearance)[0][0]])
 
 
 def check_pattern(out: str, *, several: bool, appearances: int, depth: bool = False) -> None:

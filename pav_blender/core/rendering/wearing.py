@@ -16,6 +16,7 @@ from ..deformation import Clearance, Deformer, clearance
 from ..errors import InputError
 from ..field.avatar import Avatar
 from ..field.field import Worn
+from ..field.identities import check_one_person, code
 from ..field.mixture import Mixture
 from .guide import guide, neighbourhood
 
@@ -29,12 +30,14 @@ _BLUR = 0.012  # metres, the deviation
 @dataclass(frozen=True, eq=False)
 class Wearing:
     """The appearances worn, where they fill canonical space, and the greatest density (1/m) to
-    expect in each of its cells [G, G, G]; mixture: None for one appearance alone."""
+    expect in each of its cells [G, G, G]; mixture: None for one appearance alone; person: whose
+    head they are (`identities.code`)."""
 
     worn: Worn
     mixture: Mixture | None
     space: Clearance
     guide: torch.Tensor
+    person: torch.Tensor
 
 
 _deformers: weakref.WeakKeyDictionary[Avatar, Deformer] = weakref.WeakKeyDictionary()
@@ -53,14 +56,18 @@ _mixed: weakref.WeakKeyDictionary[Avatar, OrderedDict[tuple[tuple[int, ...], byt
 def wearing_of(avatar: Avatar, appearance: Appearance) -> Wearing:
     """An appearance by name, or several, each by a weight or by one at every vertex [V].
 
-    Only the weights' proportions count. InputError for unknown names, and for weights that are
-    negative, not finite, or all nothing at some vertex.
+    Only the weights' proportions count. InputError for unknown names, for those of several people,
+    and for weights that are negative, not finite, or all nothing at some vertex.
     """
     rows, shares = shares_of(avatar, appearance)
     if len(rows) == 1:
         row = rows[0]
         return Wearing(
-            avatar.field.wearing([row]), None, space_of(avatar, row), guide_of(avatar, row)
+            avatar.field.wearing([row]),
+            None,
+            space_of(avatar, row),
+            guide_of(avatar, row),
+            code(avatar, row),
         )
     known = _mixed.setdefault(avatar, OrderedDict())
     key = rows, shares.tobytes()
@@ -94,6 +101,7 @@ def shares_of(avatar: Avatar, appearance: Appearance) -> tuple[tuple[int, ...], 
     shares = weights / total
     shares[shares < _SOME] = 0
     rows = np.flatnonzero(shares.any(0))
+    check_one_person(avatar, rows.tolist())
     shares = shares[:, rows]
     return tuple(rows.tolist()), np.ascontiguousarray(shares / shares.sum(1, keepdims=True))
 
@@ -104,7 +112,8 @@ def _mix(avatar: Avatar, rows: tuple[int, ...], shares: np.ndarray) -> Wearing:
     filled, space, guide = _where(avatar, rows, present)
     device = avatar.field.device
     mixture = Mixture(spread.to(device), filled.to(device))
-    return Wearing(avatar.field.wearing(list(rows)), mixture, space, guide)
+    worn = avatar.field.wearing(list(rows))
+    return Wearing(worn, mixture, space, guide, code(avatar, rows[0]))
 
 
 def _where(
@@ -205,7 +214,8 @@ def guide_of(avatar: Avatar, row: int) -> torch.Tensor:
     known = _guides.setdefault(avatar, {})
     if row not in known:
         worn = avatar.field.wearing([row])
-        known[row] = guide(avatar, deformer_of(avatar), worn, avatar.occupied[row])
+        person, occupied = code(avatar, row), avatar.occupied[row]
+        known[row] = guide(avatar, deformer_of(avatar), worn, person, occupied)
     return known[row]
 
 

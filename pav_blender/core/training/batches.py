@@ -163,8 +163,10 @@ def pick_samples(
     config: Config,
     step: float,
     generator: torch.Generator,
+    codes: torch.Tensor | None = None,
 ) -> Picked:
-    """The samples of all rays, by what the field was of late; no network runs."""
+    """The samples of all rays, by what the field was of late; no network runs. codes [A, P]: of
+    several people, whose head each appearance is (`identities.codes`)."""
     ops = kernels.select("cpu")
     count = len(pixels.rays)
     stops = [*pixels.starts[1:], count]
@@ -204,7 +206,8 @@ def pick_samples(
         steps.append(picks.steps.view(-1)[slots])
         frame.append(torch.full((len(packed),), index, dtype=torch.int32))
         expression = pixels.frames[index].expression
-        conditions.append(condition(config, expression, posed.stance.turn))
+        person = None if codes is None else codes[appearance]
+        conditions.append(condition(config, expression, posed.stance.turn, person))
         directions.append(rays[1] @ torch.from_numpy(posed.stance.rotation))
     fields = ("ray", "t", "triangle", "barycentric", "canonical", "distance")
     packed = Packed(*(torch.cat([getattr(p, name) for p in parts]) for name in fields))

@@ -11,11 +11,19 @@ from ..field.avatar import Avatar
 from ..progress import Report
 from .carving import carve, hull_box, reach_of
 from .frames import Frame, load_frames
+from .people import People
 
 
-def load_training_frames(collection: Collection, progress: Report | None = None) -> list[Frame]:
+def load_training_frames(
+    collection: Collection | People, progress: Report | None = None
+) -> list[Frame]:
     """Every frame of the "train" split; InputError where an appearance has none."""
     frames: list[Frame] = []
+    if isinstance(collection, People):
+        for done, (name, own) in enumerate(collection.collections.items()):
+            read = _part(progress, done, len(collection.collections))
+            frames += [collection.joined(name, f) for f in load_training_frames(own, read)]
+        return frames
     total = max(1, sum(len(clip.indices("train")) for clip in collection.clips))
 
     def report(part: float, **fields: object) -> None:
@@ -33,10 +41,12 @@ def load_training_frames(collection: Collection, progress: Report | None = None)
     return frames
 
 
-def new_avatar(collection: Collection, frames: list[Frame], config: Config) -> Avatar:
+def new_avatar(collection: Collection | People, frames: list[Frame], config: Config) -> Avatar:
     """An untrained avatar whose space is carved by the mattes of the frames."""
-    head = collection.head
-    canonical = head.canonical(collection.betas)
+    people = collection if isinstance(collection, People) else None
+    first = collection.first if isinstance(collection, People) else collection
+    head = first.head
+    canonical = people.canonical if people else head.canonical(first.betas)
     groups = [
         [f for f in frames if f.appearance == index] for index in range(len(collection.appearances))
     ]
@@ -65,10 +75,11 @@ def new_avatar(collection: Collection, frames: list[Frame], config: Config) -> A
         box_min=corner,
         box_size=size,
         occupied=occupied,
-        head_name=collection.head_name,
+        head_name=first.head_name,
         head_fingerprint=head.fingerprint,
         betas=collection.betas,
         head_offset=collection.head_offset,
+        identities=people.identities if people else {},
         record={
             "frames": {
                 name: sum(f.appearance == index for f in frames)
@@ -76,6 +87,13 @@ def new_avatar(collection: Collection, frames: list[Frame], config: Config) -> A
             }
         },
     )
+
+
+def _part(progress: Report | None, done: int, count: int) -> Report | None:
+    """The report of one of `count` equal parts of a work."""
+    if progress is None:
+        return None
+    return lambda fraction, **fields: progress((done + fraction) / count, **fields)
 
 
 def _doubled(cells: np.ndarray) -> np.ndarray:

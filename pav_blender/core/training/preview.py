@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 import time
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from ..rendering.rays import camera_rays
 from ..rendering.render import RenderSettings, trace_rays
 from ..tracking.crop import resize
 from .frames import Frame, load_frames
+from .people import People
 from .places import COLUMNS, CURVE, PICTURE, read_curve
 from .trainer import Status, Trainer
 
@@ -36,14 +38,16 @@ _MOST_POINTS = 500  # of the curve
 class Preview:
     """Shows `trainer`'s avatar beside frames that it does not learn from, where there are any."""
 
-    def __init__(self, folder: Path | str, collection: Collection, trainer: Trainer) -> None:
+    def __init__(
+        self, folder: Path | str, collection: Collection | People, trainer: Trainer
+    ) -> None:
         self.folder = Path(folder)
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise InputError(f"{folder}: cannot write there: {error.strerror}") from error
         self._trainer = trainer
-        self._frames = [_sight(collection, name) for name in collection.appearances[:MOST_COLUMNS]]
+        self._frames = _sights(collection)
         self._truth = [_on_grey(frame.rgba / np.float32(255)) for frame in self._frames]
         self._points = [
             point for point in read_curve(self.folder) if point[0] <= trainer.status.iteration
@@ -88,6 +92,16 @@ class Preview:
         settings = RenderSettings.preset("preview")
         rgba, _ = trace_rays(self._trainer.scene(frame), rays, settings)
         return _on_grey(rgba.reshape(SIDE, SIDE, 4))
+
+
+def _sights(collection: Collection | People) -> list[Frame]:
+    """A frame of each of the first appearances; people take turns."""
+    if not isinstance(collection, People):
+        return [_sight(collection, name) for name in collection.appearances[:MOST_COLUMNS]]
+    people = collection.collections.items()
+    turns = zip_longest(*([(n, c, look) for look in c.appearances] for n, c in people))
+    shown = [place for turn in turns for place in turn if place is not None][:MOST_COLUMNS]
+    return [collection.joined(name, _sight(own, look)) for name, own, look in shown]
 
 
 def _sight(collection: Collection, appearance: str) -> Frame:

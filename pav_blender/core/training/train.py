@@ -16,6 +16,7 @@ from ..field.avatar import Avatar
 from ..kernels.cpu.threads import torch_alone
 from ..progress import Report
 from .checkpoint import load_checkpoint, save_checkpoint
+from .people import People
 from .places import checkpoint_path
 from .prepare import load_training_frames, new_avatar
 from .preview import Preview
@@ -27,7 +28,7 @@ CHECKPOINT_SECONDS = 30.0
 
 
 def train(
-    collection: Collection | Path | str,
+    collection: Collection | People | Path | str,
     out: Path | str,
     config: Config | None = None,
     *,
@@ -42,7 +43,8 @@ def train(
     should_stop: Callable[[], bool] | None = None,
     device: torch.device | str = "cpu",
 ) -> Avatar:
-    """Trains an avatar on the "train" frames of a collection and writes it to `out`.
+    """Trains an avatar on the "train" frames of a collection, or of several people
+    (`people.read_people`), and writes it to `out`.
 
     minutes: plan for this much time in the loop instead of `config.iterations`. A checkpoint is
     kept beside `out` while the work goes on, written anew every `checkpoint_every` seconds;
@@ -51,7 +53,7 @@ def train(
     a folder for pictures of how it is going (`.preview`). Raises Cancelled (the checkpoint stays)
     when `should_stop()`, InputError for bad input.
     """
-    if not isinstance(collection, Collection):
+    if not isinstance(collection, Collection | People):
         collection = read_collection(collection)
     if minutes is not None and not minutes > 0:
         raise InputError(f"--minutes {minutes}: above 0")
@@ -64,17 +66,18 @@ def train(
     config = config or Config()
     if refined is not None and not config.refine_poses:
         raise InputError(f"--refined-collection {refined}: goes with --refine-poses only")
-    if refined is not None:
-        refined_writer(collection, refined, {})  # refuses now what it would refuse at the end
+    refining_of = _one_person(collection) if config.refine_poses else None
+    if refined is not None and refining_of is not None:
+        refined_writer(refining_of, refined, {})  # refuses now what it would refuse at the end
     frames = load_training_frames(collection, loading)
     source = fingerprint(collection)
-    held = kept_out(collection, frames) if config.refine_poses else set()
+    held = kept_out(refining_of, frames) if refining_of is not None else set()
     learned = [frame for frame in frames if frame.name not in held]
     avatar = new_avatar(collection, frames, config)
     trainer = Trainer(avatar, learned, minutes=minutes, device=device)
     refiner = None
-    if config.refine_poses:
-        refiner = trainer.refiner = Refiner(collection, frames, held, trainer)
+    if refining_of is not None:
+        refiner = trainer.refiner = Refiner(refining_of, frames, held, trainer)
     if resume:
         load_checkpoint(saved, trainer, source)
     shown = None if preview is None else Preview(preview, collection, trainer)
@@ -119,8 +122,21 @@ def train(
     return avatar
 
 
-def fingerprint(collection: Collection) -> str:
+def _one_person(collection: Collection | People) -> Collection:
+    """The collection to refine the track of; InputError for several people."""
+    if isinstance(collection, People):
+        raise InputError(
+            "--refine-poses takes one person: first refine each one's collection by itself, with "
+            "--refined-collection, then train on what that wrote"
+        )
+    return collection
+
+
+def fingerprint(collection: Collection | People) -> str:
     """Short hash of what a training reads: tracks, splits and the pictures' names."""
+    if isinstance(collection, People):
+        own = ((name, fingerprint(c)) for name, c in collection.collections.items())
+        return hashlib.sha256(repr([*own]).encode()).hexdigest()[:16]
     digest = hashlib.sha256(collection.head.fingerprint.encode())
     digest.update(collection.betas.tobytes())
     for clip in collection.clips:

@@ -15,6 +15,7 @@ from ..config import Config
 from ..deformation import Deformer
 from ..field.avatar import Avatar
 from ..field.field import Samples, condition
+from ..field.identities import codes
 from ..rendering.render import Scene
 from ..rendering.wearing import Wearing
 from .attention import Attention
@@ -87,6 +88,7 @@ class Trainer:
         self.generator = torch.Generator().manual_seed(self.config.seed)
         deformer = Deformer(avatar.canonical_vertices, avatar.triangles, self.config.frames)
         self.visibility = Visibility(avatar, deformer)
+        self._codes = codes(avatar)
         self._poses = Poses(deformer, avatar.canonical_vertices, avatar.rigid_weights)
         self.attention = Attention()
         self._pyramid = [_by_appearance(frames, len(avatar.appearances))]
@@ -127,7 +129,13 @@ class Trainer:
         count = len(pixels.rays)
         with torch.no_grad():
             picked = pick_samples(
-                self._poses, pixels, self.visibility, config, status.step, self.generator
+                self._poses,
+                pixels,
+                self.visibility,
+                config,
+                status.step,
+                self.generator,
+                self._codes,
             )
             samples = picked.samples.to(self.device)
             encoded = field.encode(samples)
@@ -168,8 +176,9 @@ class Trainer:
         posed = self._poses(frame, space, version, self.config.reach)
         with torch.no_grad():
             worn = field.wearing([row])
-            seen = condition(self.config, frame.expression, posed.stance.turn)
-        wearing = Wearing(worn, None, space, self.visibility.guide[row])
+            person = self._codes[row]
+            seen = condition(self.config, frame.expression, posed.stance.turn, person)
+        wearing = Wearing(worn, None, space, self.visibility.guide[row], person)
         return Scene(self.avatar, posed.mesh, posed.voxels, posed.stance, seen, wearing)
 
     def _choose_frames(self) -> list[Frame]:
