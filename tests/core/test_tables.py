@@ -10,7 +10,7 @@ import pytest
 
 from pav_blender.cli import main
 from pav_blender.core.config import Config
-from pav_blender.core.errors import InputError
+from pav_blender.core.errors import Cancelled, InputError
 from pav_blender.core.evaluation.methods import METHODS, method
 from pav_blender.core.evaluation.paper_tables import TABLES
 from pav_blender.core.evaluation.study import Result, Study, result
@@ -152,6 +152,24 @@ def test_what_is_there_is_not_made_again(toy, quick, tmp_path):
     (tmp_path / "insta_clips-0.json").write_text("{")
     with pytest.raises(InputError, match=r"insta_clips-0\.json: not what a study wrote"):
         result(study, quick["insta_clips"], 0)
+
+
+def test_a_study_that_was_stopped_goes_on(toy, quick, tmp_path):
+    study = Study(toy, tmp_path, iterations=3, per_appearance=1)
+    seen = []
+    with pytest.raises(Cancelled, match="what was measured"):
+        result(
+            study,
+            quick["ours"],
+            0,
+            measuring=lambda done, **_: seen.append(done),
+            should_stop=lambda: (tmp_path / "ours-0.pav").is_file() and len(seen) > 0,
+        )
+    assert len(seen) == 1
+    assert not (tmp_path / "ours-0.json").exists()
+    trained = (tmp_path / "ours-0.pav").stat().st_mtime_ns
+    assert result(study, quick["ours"], 0).measures["test"]
+    assert (tmp_path / "ours-0.pav").stat().st_mtime_ns == trained
 
 
 def test_the_verb_writes_every_form_of_a_table(toy, quick, tmp_path, capsys):

@@ -78,6 +78,13 @@ def result(
         "novel": fingerprint(study.novel) if study.novel else None,
         "per_appearance": study.per_appearance,
     }
+
+    def measured(done: float, **fields: Any) -> None:
+        if should_stop is not None and should_stop():
+            raise Cancelled(f"stopped; what was measured is in {study.out}")
+        if measuring:
+            measuring(done, **fields)
+
     stored = _read(known)
     if stored.get("source") != source:
         stored = {"source": source, "sets": {}}
@@ -88,9 +95,7 @@ def result(
             p.numel() for avatar in avatars for p in avatar.field.parameters()
         )
         for name in missing:
-            if should_stop is not None and should_stop():
-                raise Cancelled(f"stopped; what was measured is in {study.out}")
-            evaluation = _measure(study, avatars, name, measuring)
+            evaluation = _measure(study, avatars, name, measured)
             stored["sets"][name] = {"summary": summary(evaluation), "rows": evaluation.rows}
             if name == "test":
                 stored["examples"] = _keep_examples(study, method, seed, evaluation.scores)
