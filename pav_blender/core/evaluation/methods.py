@@ -23,21 +23,22 @@ class Method:
 
 
 _INSTA = dataclasses.replace(_PAPER, appearance="none")
-# Z_j as the paper has it, a texture of 512 x 512 x 16 a clip
-_FULL = dataclasses.replace(_PAPER, appearance="surface")
 # the paper's vector has 512 values; they enter 64 hidden units, so that 64 can do as much, sooner
-_NO_LNF = dataclasses.replace(_FULL, appearance="global", global_channels=64)
-_NO_OFFSET = dataclasses.replace(_FULL, density_offset=False)
+_NO_LNF = dataclasses.replace(_PAPER, appearance="global", global_channels=64)
+_NO_OFFSET = dataclasses.replace(_PAPER, density_offset=False)
+# a texture of 512 x 512 x 16 a clip, read where the nearest point lies instead of at vertices
+_SURFACE = dataclasses.replace(_PAPER, appearance="surface")
 
 METHODS = (
     Method("insta", "INSTA, unified", _INSTA),
     Method("insta_clips", "INSTA, one a clip", _INSTA, per_clip=True),
     Method("no_lnf", "PAV without LNF", _NO_LNF),
     Method("no_offset", "PAV without density offset", _NO_OFFSET),
-    Method("vertex", "PAV, features a vertex", dataclasses.replace(_FULL, appearance="vertex")),
-    Method("full", "PAV, full", _FULL),
+    Method("surface", "PAV, features on the surface", _SURFACE),
+    # features at the vertices of the nearest triangle, as the paper reads them
+    Method("full", "PAV, full", _PAPER),
     Method("ours", "ours", Config()),
-)  # fmt: skip
+)
 
 
 def method(key: str) -> Method:

@@ -30,7 +30,7 @@ _SETS = {
     "view": "cameras that no clip used",
     "novel": "another performance",
 }
-_ABLATION = ("insta", "no_lnf", "no_offset", "vertex", "full", "ours")
+_ABLATION = ("insta", "no_lnf", "no_offset", "surface", "full", "ours")
 _UNIFIED = ("insta", "full", "ours")
 _SEPARATE = ("insta_clips", "full", "ours")
 
