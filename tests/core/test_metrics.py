@@ -168,7 +168,8 @@ def test_a_metric_that_lacks_something_is_absent_and_nothing_is_fetched(load, of
 
 
 def test_a_package_that_does_not_load_is_absent(monkeypatch):
-    monkeypatch.setitem(sys.modules, "stlpips_pytorch", None)
+    for name in ("stlpips_pytorch", "stlpips_pytorch.stlpips"):
+        monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(learned.Absent) as absent:
         learned.st_lpips()
     assert absent.value.reason == "package absent"
