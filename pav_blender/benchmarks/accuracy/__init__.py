@@ -1,6 +1,6 @@
 """`pav bench accuracy`: how wrong pictures, gradients and files are, each against a bound.
 
-Bounds stand in the modules, each with where it comes from; all were written before measuring.
+Bounds stand in the modules, each with where it comes from.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Every approximation of a picture switched on alone: its error against its bound, and its worth.
 
-`BOUNDS` were written down before anything was measured. A largest difference is given where one can
+`BOUNDS` were written down before these were measured. A largest difference is given where one can
 be derived; where a skip goes by what a guide knows, which proves nothing, a PSNR is aimed at.
 """
 
