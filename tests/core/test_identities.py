@@ -12,6 +12,7 @@ from toy import make_toy
 from pav_blender.cli import main
 from pav_blender.core.baking.bake import neutral_scene
 from pav_blender.core.errors import Cancelled, InputError, OtherPerson
+from pav_blender.core.evaluation.evaluate import evaluate
 from pav_blender.core.evaluation.heldout import held_out, score
 from pav_blender.core.evaluation.report import measure
 from pav_blender.core.field.avatar import Avatar, head_of, read_header
@@ -135,8 +136,19 @@ def test_each_person_is_shown_with_the_own_look(avatar, people):
 
 
 def test_a_persons_frames_are_measured_in_that_persons_appearances(avatar, people):
-    found = measure(avatar, people.collections["ben"], 1)
-    assert list(found.scores) == IDENTITIES["ben"]
+    ben = people.collections["ben"]
+    assert list(measure(avatar, ben, 1).scores) == IDENTITIES["ben"]
+    found = evaluate(avatar, ben, metrics=["head_psnr"], appearances=["bushy"], keep=1)
+    assert [score.appearance for score in found.scores] == ["ben/bushy"]
+    assert {row["appearance"] for row in found.rows} == {"bushy"}
+    assert found.left_out == []
+
+
+def test_a_stranger_is_told(avatar, people):
+    ben = people.collections["ben"]
+    stranger = dataclasses.replace(ben, betas=-np.float32(OTHER))
+    with pytest.raises(InputError, match="none of anna, ben"):
+        held_out(avatar, stranger)
 
 
 def test_the_density_learns_and_sees_whose_head_it_is(avatar, people):

@@ -13,6 +13,7 @@ import numpy as np
 from ..collection import SPLITS, Clip, Collection
 from ..errors import InputError
 from ..field.avatar import Avatar
+from ..field.identities import own_appearances
 from ..progress import Report
 from ..rendering.render import RenderSettings
 from ..rendering.sequence import check_head
@@ -87,7 +88,8 @@ def evaluate(
     keep: int = 0,
     progress: Report | None = None,
 ) -> Evaluation:
-    """Renders frames wearing their own appearance, matched by name, and compares the pictures.
+    """Renders frames wearing their own appearance, matched by name (of several people, among those
+    of the one that the collection was tracked on), and compares the pictures.
 
     Pictures are compared before white, the truth with its matte as alpha, as in training. What the
     avatar does not wear is left out. per_appearance: frames of each appearance and split at most,
@@ -101,11 +103,14 @@ def evaluate(
     _check_names("appearance", appearances or [], collection.appearances)
     if per_appearance is not None and per_appearance < 1:
         raise InputError(f"per_appearance {per_appearance}: at least 1")
+    own = dict(
+        zip(collection.appearances, own_appearances(avatar, collection), strict=True)
+    )  # what the avatar calls them
     for name in appearances or []:
-        avatar.appearance_index(name)
+        avatar.appearance_index(own[name])
     if weights is not None and not weights.is_dir():
         raise InputError(f"{weights}: no such folder; it should hold networks' weights")
-    chosen = [n for n in appearances or collection.appearances if n in avatar.appearances]
+    chosen = [n for n in appearances or own if own[n] in avatar.appearances]
     todo = _frames(collection, chosen, splits, per_appearance, keep)
     if not todo:
         raise InputError(
@@ -113,13 +118,13 @@ def evaluate(
             f"{', '.join(avatar.appearances)}"
         )
     result = Evaluation([], {}, [], metrics=tuple(metrics))
-    result.left_out = [n for n in collection.appearances if n not in avatar.appearances]
+    result.left_out = [n for n in own if own[n] not in avatar.appearances]
     compared, look = _load(result, weights)
     ours_seen, truth_seen = [], []
     settings = settings or RenderSettings()
     for done, (clip, row, split, kept) in enumerate(todo):
         frame = load_frames(collection, clip, np.array([row]), targets=False)[0]
-        scored = score(avatar, frame, clip.appearance, settings)
+        scored = score(avatar, frame, own[clip.appearance], settings)
         ours, truth = over(scored.rendered, BACKGROUND), over(frame.rgba / 255, BACKGROUND)
         values = {k: getattr(scored, k) for k in ("psnr", "head_psnr", "ssim") if k in metrics}
         values |= {key: compare(ours, truth) for key, compare in compared.items()}

@@ -102,7 +102,7 @@ def own_appearances(avatar: Avatar, collection: Collection) -> list[str]:
     is nobody's.
     """
     if not avatar.identities:
-        return avatar.appearances
+        return collection.appearances
     people = [identity(avatar, looks[0]) for looks in avatar.identities.values()]
     tracked = collection.head.shaped(collection.betas)
     far = [identity_distance(collection.head, p.neutral(collection), tracked) for p in people]
