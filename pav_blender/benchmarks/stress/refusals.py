@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -87,7 +88,11 @@ def parameters(given: Given) -> Found:
         render_scene(scene, head.camera, limit=np.full((48, 48), value))
 
     def setting(name: str) -> Callable[[float], object]:
-        return lambda value: dataclasses.replace(RenderSettings(), **{name: value})
+        def act(value: float) -> None:
+            values: dict[str, Any] = {name: value}
+            RenderSettings(**values)
+
+        return act
 
     def config(name: str) -> Callable[[float], object]:
         return lambda value: Config.from_json({name: value})

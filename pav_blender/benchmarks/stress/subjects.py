@@ -93,8 +93,9 @@ def ball_on(vertices: np.ndarray, triangles: np.ndarray, appearances: int = 2) -
     avatar = Avatar.create(config, names, vertices, triangles, uvs, triangles, ("smile", "frown"))
     generator = torch.Generator().manual_seed(1)
     with torch.no_grad():
-        for values, size in ((avatar.field.tables, 0.5), (avatar.field.still_tables, 0.5)):
-            values.copy_(size * (2 * torch.rand(values.shape, generator=generator) - 1))
+        for values in (avatar.field.tables, avatar.field.still_tables):
+            values.copy_(0.15 * (2 * torch.rand(values.shape, generator=generator) - 1))
+        avatar.field.colour.weights[-1].mul_(6)  # loud
     camera = Camera(
         48,
         48,

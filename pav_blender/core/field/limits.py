@@ -17,14 +17,13 @@ def overflowing(field: Field) -> str | None:
     weights times that; its parts take each other's output in turn.
     """
     config = field.config
-    tables = max(_most(field.tables), _most(getattr(field, "still_tables", field.tables[:0])))
+    tables = _most(field.tables) + _most(getattr(field, "still_tables", field.tables[:0]))
     embedding = _most(field.latent) + _most(field.code)
     geometry = _reach(field.density, tables)
     raw = geometry
     if field.offset is not None:
-        seen = max(embedding, geometry if config.offset_sees_geometry else 0.0)
-        raw += _reach(field.offset, seen)
-    colour = _reach(field.colour, max(embedding, raw))
+        raw += _reach(field.offset, embedding + geometry * config.offset_sees_geometry)
+    colour = _reach(field.colour, embedding + raw)
     parts = {"tables": tables, "latent": embedding, "density": geometry, "offset": raw}
     for name, reach in (parts | {"colour": colour}).items():
         if not reach <= _MOST:
@@ -33,13 +32,14 @@ def overflowing(field: Field) -> str | None:
 
 
 def _reach(network: Mlp, most: float) -> float:
-    """The largest value that any layer of a network can have, for inputs up to `most`."""
+    """The largest value that any layer of a network can have, for inputs up to `most`; infinite or
+    not a number where that has no end."""
     group = float(network.group_weight.detach().double().abs().sum(1).max()) * _CONDITION
     largest = 0.0
     for index, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True)):
         sums = weight.detach().double().abs().sum(1)
         most = float((sums * most + bias.detach().double().abs()).max()) + group * (index == 0)
-        largest = max(largest, most)
+        largest += most  # a sum, for `max` would pass over what is not a number
     return largest
 
 
