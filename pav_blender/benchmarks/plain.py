@@ -10,6 +10,7 @@ from ..core.deformation import Deformer
 from ..core.deformation.rigid import stance
 from ..core.field.avatar import Avatar
 from ..core.field.field import condition
+from ..core.kernels.cpu.threads import torch_alone
 from ..core.rendering.cameras import Camera
 from ..core.rendering.rays import camera_rays, pack, samples_of
 from ..core.rendering.wearing import space_of
@@ -37,7 +38,7 @@ def quadrature(
 ) -> np.ndarray:
     """Premultiplied colour and opacity [N, 4] of pixels (row * width + column) [N], with a place
     every `step` metres."""
-    with torch.inference_mode(), kernels.plain_torch():
+    with torch.inference_mode(), kernels.plain_torch(), torch_alone():
         deformer = Deformer(
             avatar.canonical_vertices, avatar.triangles, avatar.config.frames, reference=True
         )

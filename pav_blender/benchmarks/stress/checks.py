@@ -5,8 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import torch
 
+from ...core.deformation import Deformer
 from ...core.evaluation.metrics import over, psnr
+from ...core.kernels.cpu.threads import torch_alone
 from ...core.rendering.cameras import Camera
 from ...core.rendering.render import Picture, RenderSettings, render
 from ..plain import quadrature
@@ -19,6 +22,7 @@ WHOLE = RenderSettings(step=COARSE, skip=False, transmittance=0.0, negligible=0.
 EVERY = RenderSettings(step=COARSE, probe=1, longest=1, transmittance=0.0, negligible=0.0)
 LEVELS = 255.0
 _PIXELS = 6  # that the oracle looks at
+_POINTS = 300
 
 
 def shown(head: Head, settings: RenderSettings | None = None, camera: Camera | None = None,
@@ -69,31 +73,53 @@ def sound(found: Found, picture: Picture, camera: Camera, of: str = "") -> None:
 
 
 def same_bits(found: Found, head: Head, first: Picture, settings: RenderSettings | None = None,
-              camera: Camera | None = None) -> None:  # fmt: skip
+              camera: Camera | None = None, of: str = "") -> None:  # fmt: skip
     """Claims that the same input gives the same bits."""
     again = shown(head, settings, camera)
     differ = (first.rgba != again.rgba).sum() + (first.depth != again.depth).sum()
-    found.at_most("numbers that differ when drawn again", int(differ), 0)
+    found.at_most(f"numbers that differ when drawn again{of}", int(differ), 0)
+
+
+def right_distances(found: Found, head: Head) -> None:
+    """Claims that the distance to the mesh is that of trying every triangle in float64."""
+    random = np.random.default_rng(0)
+    low, high = head.vertices.min(0), head.vertices.max(0)
+    points = torch.from_numpy(
+        random.uniform(low - 0.02, high + 0.02, (_POINTS, 3)).astype(np.float32)
+    )
+    distances = []
+    for reference in (False, True):
+        avatar = head.avatar
+        mode = avatar.config.frames
+        deformer = Deformer(avatar.canonical_vertices, avatar.triangles, mode, reference=reference)
+        with torch_alone():
+            distances.append(deformer.nearest(deformer.pose(head.vertices), points)[2].double())
+    gap = float((distances[0] - distances[1]).abs().max())
+    found.at_most("distances from float64", gap * 1e6, 1.0, "um")
 
 
 def agrees(found: Found, head: Head, *, levels: float = 2.0, skip_db: float = 35.0,
-           near: tuple[int, int] | None = None) -> None:  # fmt: skip
+           near: tuple[int, int] | None = None, of: str = "") -> None:  # fmt: skip
     """Claims that the picture is the oracle's (plain torch, distances in float64, every sample
     against every triangle) where nothing is passed over, and hardly another where empty space is.
 
-    near: a pixel (column, row) about which the oracle looks; else where the picture shows most.
+    near: a pixel (column, row) about which the oracle looks; else it looks where anything
+    shows. of: what is said of which picture in the claims' names.
     """
     camera = head.camera
     whole, every = shown(head, WHOLE), shown(head, EVERY)
-    sound(found, shown(head), camera)
+    sound(found, shown(head), camera, of)
     flat = black(whole).reshape(-1, 4)
     pixels = _chosen(flat[:, 3], camera, near)
     truth = quadrature(head.avatar, head.vertices, head.expression, 0, camera, pixels, COARSE)
     found.at_most(
-        "from plain torch, worst pixel", np.abs(flat[pixels] - truth).max() * LEVELS, levels, "/255"
+        f"from plain torch, worst pixel{of}",
+        np.abs(flat[pixels] - truth).max() * LEVELS,
+        levels,
+        "/255",
     )
-    found.at_least("with empty space passed over", likeness(every, whole), skip_db, "dB")
-    same_bits(found, head, every, EVERY)
+    found.at_least(f"with empty space passed over{of}", likeness(every, whole), skip_db, "dB")
+    same_bits(found, head, every, EVERY, of=of)
 
 
 def _chosen(alpha: np.ndarray, camera: Camera, near: tuple[int, int] | None) -> np.ndarray:

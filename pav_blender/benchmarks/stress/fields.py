@@ -10,7 +10,7 @@ import torch
 from ...core import kernels
 from ...core.errors import InputError
 from ...core.field.avatar import Avatar
-from .checks import agrees, black, likeness, shown, sound
+from .checks import LEVELS, agrees, black, likeness, shown, sound
 from .scene import Found, Given, Scene
 from .subjects import Head, ball_of
 
@@ -59,10 +59,10 @@ def colours(given: Given) -> Found:
     for value, wanted in ((-1e4, 0.0), (1e4, 1.0)):
         head = _biased(given.ball, "colour", value)
         picture = shown(head)
-        sound(found, picture, head.camera, f" at {value:g}")
         seen = picture.rgba[picture.rgba[..., 3] > 0][:, :3]
-        found.at_most(f"from what it must be at {value:g}", np.abs(seen - wanted).max(), 1e-6)
-        agrees(found, head)
+        gap = np.abs(seen - wanted).max() * LEVELS
+        found.at_most(f"from what it must be at {value:g}", gap, 0.001, "/255")
+        agrees(found, head, of=f" at {value:g}")
     return found
 
 
@@ -118,7 +118,7 @@ def denormal(given: Given) -> Found:
     agrees(found, head)
     moved = given.ball
     tiny = np.where(np.abs(moved.vertices) < 1e-3, np.float32(1e-42), moved.vertices)
-    agrees(found, replace(moved, vertices=tiny.astype(np.float32)))
+    agrees(found, replace(moved, vertices=tiny.astype(np.float32)), of=", in the mesh")
     return found
 
 

@@ -148,7 +148,7 @@ def fields_of_view(given: Given) -> Found:
         pose[2, 3] = 0.5 if degrees < 90 else 0.16
         other = replace(head, camera=replace(camera, camera_to_world=pose))
         if degrees in (0.1, 170.0):
-            agrees(found, other, skip_db=28)
+            agrees(found, other, skip_db=28, of=f", {degrees:g} degrees")
         else:
             sound(found, shown(other), other.camera, f" at {degrees:g} degrees")
     return found
@@ -189,11 +189,7 @@ def along_an_edge(given: Given) -> Found:
         ("in a plane of the box", np.array([0.0, 0.0, 0.4]), np.array([0.0, 0, -1])),
     ):
         camera = _one_ray(start, direction)
-        before = len(found.claims)
-        agrees(found, replace(head, camera=camera), near=(1, 1))
-        found.claims[before:] = [
-            replace(claim, name=f"{claim.name}, {name}") for claim in found.claims[before:]
-        ]
+        agrees(found, replace(head, camera=camera), near=(1, 1), of=f", {name}")
     return found
 
 

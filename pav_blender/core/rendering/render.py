@@ -161,24 +161,24 @@ def pose_scene(
     for name, value in zip(avatar.expression_names, values, strict=True):
         if not abs(value) <= _MOST:
             raise InputError(f"expression {name!r} is {value}: from {-_MOST:g} to {_MOST:g}")
-    _check_size(avatar, vertices)
-    origin = np.round(vertices.mean(0, dtype=np.float64) / _SHIFT) * _SHIFT
+    deformer = deformer_of(avatar)
+    used = deformer.referenced.numpy()
+    canonical = avatar.canonical_vertices[used]
+    _check_size(canonical, vertices[used])
+    origin = np.round(vertices[used].mean(0, dtype=np.float64) / _SHIFT) * _SHIFT
     vertices = np.ascontiguousarray(vertices - origin, np.float32)
     wearing = wearing_of(avatar, appearance)
-    stands = stance(avatar.canonical_vertices, vertices, avatar.rigid_weights)
-    mesh = deformer_of(avatar).pose(vertices)
+    stands = stance(canonical, vertices[used], avatar.rigid_weights[used])
+    mesh = deformer.pose(vertices)
     filled = voxels(mesh, wearing.space, avatar.config.reach)
     seen = condition(avatar.config, values.astype(np.float32), stands.turn, wearing.person)
     return Scene(avatar, mesh, filled, stands, seen, wearing, origin)
 
 
-def _check_size(avatar: Avatar, vertices: np.ndarray) -> None:
+def _check_size(canonical: np.ndarray, posed: np.ndarray) -> None:
     """InputError unless a posed mesh is about as large as the canonical one: what a step along a
     ray is, and how much memory a pose takes, goes by metres."""
-    corners = np.unique(avatar.triangles)
-    size, usual = (
-        float(np.ptp(v[corners], 0).max()) for v in (vertices, avatar.canonical_vertices)
-    )
+    size, usual = (float(np.ptp(vertices, 0).max()) for vertices in (posed, canonical))
     if not _SMALLEST * usual <= size <= _LARGEST * usual:
         raise InputError(
             f"the posed mesh is {size:.3g} m across, the avatar's head {usual:.3g} m; from "
