@@ -23,11 +23,16 @@ from .subjects import Head
 BAD = (np.nan, np.inf, -np.inf)
 
 
-def _all_refused(cases: dict[str, Callable[[float], object]], words: str) -> Found:
-    """Claims that every case raises an InputError, for each of BAD, that says one of `words`."""
-    found, refused = Found(), 0
+def _all_refused(
+    cases: dict[str, Callable[[float], object]],
+    words: str,
+    bad: tuple[float, ...] = BAD,
+    found: Found | None = None,
+) -> Found:
+    """Claims that every case raises an InputError, for each of `bad`, that says one of `words`."""
+    found, refused = found or Found(), 0
     for name, act in cases.items():
-        for value in BAD:
+        for value in bad:
             try:
                 act(value)
                 message = "taken"
@@ -35,11 +40,13 @@ def _all_refused(cases: dict[str, Callable[[float], object]], words: str) -> Fou
                 message = str(error)
                 refused += any(word in message for word in words.split("|"))
             found.raw[f"{name}, {value}"] = message.split("/")[-1]
-    found.at_least("refused by name", refused, len(cases) * len(BAD))
+    of = f" of {', '.join(cases)}" if found.claims else ""
+    found.at_least(f"refused by name{of}", refused, len(cases) * len(bad))
     return found
 
 
 def mesh(given: Given) -> Found:
+    """One vertex that is not a number, or infinite."""
     head = given.ball
 
     def one(value: float) -> None:
@@ -51,6 +58,7 @@ def mesh(given: Given) -> Found:
 
 
 def camera(given: Given) -> Found:
+    """A lens, a rotation or a place that is none."""
     head = given.ball
 
     def changed(name: str, place: tuple[int, int]) -> Callable[[float], object]:
@@ -73,6 +81,7 @@ def camera(given: Given) -> Found:
 
 
 def parameters(given: Given) -> Found:
+    """Expressions, weights of appearances, limits, settings of pictures and of training."""
     head = given.ball
 
     def smile(value: float) -> None:
@@ -83,8 +92,6 @@ def parameters(given: Given) -> Found:
 
     def limit(value: float) -> None:
         scene = pose_scene(head.avatar, head.vertices, "look 0")
-        if np.isinf(value):  # sees for ever, or nothing: both can be drawn
-            raise InputError("limit: does not apply")
         render_scene(scene, head.camera, limit=np.full((48, 48), value))
 
     def setting(name: str) -> Callable[[float], object]:
@@ -102,12 +109,12 @@ def parameters(given: Given) -> Found:
     cases: dict[str, Callable[[float], object]] = {
         "expression": smile,
         "weight": weight,
-        "limit": limit,
         **{f"render {name}": setting(name) for name in render},
         **{f"config {name}": config(name) for name in learn},
     }
-    names = "|".join(["'smile'", "weights", "limit", *render, *learn])
-    return _all_refused(cases, names)
+    found = _all_refused(cases, "|".join(["'smile'", "weights", *render, *learn]))
+    # an infinite one sees for ever, or nothing: both can be drawn
+    return _all_refused({"limit": limit}, "limit", (np.nan,), found)
 
 
 def track(given: Given) -> Found:

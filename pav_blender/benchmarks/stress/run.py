@@ -16,7 +16,6 @@ from ...core.errors import InputError
 from ...core.evaluation.report import Claim
 from ...core.progress import Report
 from . import SCENES
-from .subjects import make
 
 MOST_GB = 3.0  # of any scene's process
 _MOST_S = 300.0  # of a scene
@@ -37,8 +36,7 @@ def run(
 ) -> tuple[dict[str, Any], list[Claim]]:
     """Rows of all chosen scenes and their claims, each named after its scene."""
     wanted = chosen(names)
-    make(folder)
-    rows = []
+    rows: list[dict[str, Any]] = []
     alone = [[name] for name in wanted if SCENES[name].alone]
     for group in [[name for name in wanted if not SCENES[name].alone], *alone]:
         for row in _rows(folder, group):
