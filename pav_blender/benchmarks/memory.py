@@ -24,7 +24,7 @@ _SIZE = 512
 _ITERATIONS = 400  # each of four frames: as many poses are remembered as ever will be
 
 _PEAK = """
-from pav_blender.benchmarks.memory import peak_bytes
+from pav_blender.benchmarks.peak import peak_bytes
 print(peak_bytes())
 """
 _TRAIN = f"""
@@ -52,19 +52,6 @@ frame = chosen_frames(collection, ("test",), 1)[0]
 camera = frame.camera.resized({_SIZE}, {_SIZE})
 render(avatar, frame.vertices, camera, avatar.appearances[0])
 {_PEAK}"""
-
-
-def peak_bytes() -> int:
-    """The most memory that this process ever held."""
-    import resource  # not on Windows
-
-    # Linux counts what the parent held before the process began as the child's own in `getrusage`
-    status = Path("/proc/self/status")
-    if status.is_file():
-        lines = dict(line.split(":", 1) for line in status.read_text().splitlines())
-        return int(lines["VmHWM"].split()[0]) * 1024
-    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return most * (1 if sys.platform == "darwin" else 1024)
 
 
 def run(options: Options, progress: Report | None = None) -> tuple[dict[str, Any], list[Claim]]:

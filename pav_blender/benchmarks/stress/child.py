@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ...core.errors import PavError
-from ..memory import peak_bytes
+from ..peak import peak_bytes
 from . import SCENES
 from .scene import Given
 
