@@ -30,6 +30,7 @@ VERBS = {
     "table": "reproduce a table of the paper: ablation, comparison, efficiency",
     "eval": "measure an avatar on frames it has not seen, with the field's metrics",
     "bench": "measure speed against error: render, accuracy, train, kernels, scale, matte, track",
+    "stress": "hostile scenes: what must hold in each, and what was seen",
     "info": "what an avatar file holds",
     "doctor": "what this machine offers: packages, versions, threads",
 }

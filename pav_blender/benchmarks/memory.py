@@ -23,16 +23,9 @@ _FRAMES = 400
 _SIZE = 512
 _ITERATIONS = 400  # each of four frames: as many poses are remembered as ever will be
 
-# Linux counts what the parent held before the process began as the child's own in `getrusage`
 _PEAK = """
-import pathlib, resource, sys
-status = pathlib.Path("/proc/self/status")
-most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-most *= 1 if sys.platform == "darwin" else 1024
-if status.is_file():
-    lines = dict(line.split(":", 1) for line in status.read_text().splitlines())
-    most = int(lines["VmHWM"].split()[0]) * 1024
-print(most)
+from pav_blender.benchmarks.peak import peak_bytes
+print(peak_bytes())
 """
 _TRAIN = f"""
 import dataclasses, sys

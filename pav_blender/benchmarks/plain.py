@@ -10,6 +10,8 @@ from ..core.deformation import Deformer
 from ..core.deformation.rigid import stance
 from ..core.field.avatar import Avatar
 from ..core.field.field import condition
+from ..core.kernels.cpu.threads import torch_alone
+from ..core.rendering.cameras import Camera
 from ..core.rendering.rays import camera_rays, pack, samples_of
 from ..core.rendering.wearing import space_of
 from ..core.training.frames import Frame
@@ -20,16 +22,30 @@ _RAYS = 2  # at once: every sample is held against every triangle
 def dense(avatar: Avatar, frame: Frame, pixels: np.ndarray, samples: int = 1024) -> np.ndarray:
     """Colours before white [N, 3] of a frame's pixels (row * width + column) [N], in its own
     appearance: `samples` places along the 0.4 metres of ray around the head, each evaluated."""
-    step = 0.4 / samples
-    camera = frame.camera
-    with torch.inference_mode(), kernels.plain_torch():
+    pose = frame.vertices, frame.expression, frame.appearance
+    rgba = quadrature(avatar, *pose, frame.camera, pixels, 0.4 / samples)
+    return rgba[:, :3] + 1 - rgba[:, 3:]
+
+
+def quadrature(
+    avatar: Avatar,
+    vertices: np.ndarray,
+    expression: np.ndarray,
+    appearance: int,
+    camera: Camera,
+    pixels: np.ndarray,
+    step: float,
+) -> np.ndarray:
+    """Premultiplied colour and opacity [N, 4] of pixels (row * width + column) [N], with a place
+    every `step` metres."""
+    with torch.inference_mode(), kernels.plain_torch(), torch_alone():
         deformer = Deformer(
             avatar.canonical_vertices, avatar.triangles, avatar.config.frames, reference=True
         )
-        mesh, space = deformer.pose(frame.vertices), space_of(avatar, frame.appearance)
-        stands = stance(avatar.canonical_vertices, frame.vertices, avatar.rigid_weights)
-        seen = condition(avatar.config, frame.expression, stands.turn)
-        worn = avatar.field.wearing([frame.appearance])
+        mesh, space = deformer.pose(vertices), space_of(avatar, appearance)
+        stands = stance(avatar.canonical_vertices, vertices, avatar.rigid_weights)
+        seen = condition(avatar.config, expression, stands.turn)
+        worn = avatar.field.wearing([appearance])
         ops = kernels.select("cpu").marching
         found = []
         for start in range(0, len(pixels), _RAYS):
@@ -40,11 +56,12 @@ def dense(avatar: Avatar, frame: Frame, pixels: np.ndarray, samples: int = 1024)
             first, last = ops.lattice(*around, jitter, step)
             wave = ops.march(
                 mesh, rays.origins, rays.directions, first, last, jitter, step,
-                wave=4 * samples, clearance=space, band=avatar.config.reach,
+                wave=max(1, int((last - first).max()) + 1), clearance=space,
+                band=avatar.config.reach,
             )  # fmt: skip
             packed, _ = pack(wave, jitter, step)
             taken = samples_of(packed, space, 0, seen, rays, stands)
             sigma, rgb = avatar.field(taken, worn)
             colour, opacity, _, _ = ops.composite(sigma, rgb, packed.t, step, taken.ray, len(part))
-            found.append(colour + 1 - opacity[:, None])
+            found.append(torch.cat([colour, opacity[:, None]], 1))
     return torch.cat(found).numpy()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -92,8 +93,13 @@ class Config:
                 raise InputError(f"{name} must be at least 1, not {getattr(self, name)}")
         if not 3 <= self.log2_entries <= 24:
             raise InputError(f"log2_entries {self.log2_entries}: from 3 to 24")
-        if not self.step > 0:
-            raise InputError(f"step {self.step}: metres, above 0")
+        for setting in dataclasses.fields(self):
+            value = getattr(self, setting.name)
+            if isinstance(value, float) and not math.isfinite(value):
+                raise InputError(f"{setting.name} must be a finite number, not {value}")
+        for name in ("step", "reach"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"{name} {getattr(self, name)}: metres, above 0")
 
     @classmethod
     def paper(cls) -> Config:

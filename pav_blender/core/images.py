@@ -74,7 +74,7 @@ def read_rgba(path: Path | str) -> np.ndarray:
 def read_scene_linear(path: Path | str) -> np.ndarray:
     """Reads an EXR or HDR picture as float32 [H, W, 4], premultiplied; an absent alpha reads 1.
 
-    Raises InputError for a missing or damaged file.
+    Raises InputError for a missing or damaged file, and for pixels that are not finite.
     """
     pixels = _read(path, "float")
     if pixels.ndim == 2:
@@ -83,7 +83,11 @@ def read_scene_linear(path: Path | str) -> np.ndarray:
         pixels = np.concatenate([np.repeat(pixels[..., :1], 3, axis=2), pixels[..., 1:2]], axis=2)
     if pixels.shape[2] == 3:
         pixels = np.concatenate([pixels, np.ones_like(pixels[..., :1])], axis=2)
-    return np.nan_to_num(np.ascontiguousarray(pixels[..., :4], np.float32))
+    pixels = np.ascontiguousarray(pixels[..., :4], np.float32)
+    bad = int((~np.isfinite(pixels)).any(2).sum())
+    if bad:
+        raise InputError(f"{path}: {bad} pixels are not finite numbers; render or save it anew")
+    return pixels
 
 
 def check(path: Path | str) -> None:

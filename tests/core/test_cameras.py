@@ -92,3 +92,21 @@ def test_triangles_behind_the_camera_or_without_area_draw_nothing():
     vertices = np.array([[-1, -1, -1], [1, -1, -1], [0, 1, -1], [0, 0, 1], [0, 0, 1.0]])
     depth, _, _ = rasterise(vertices, np.array([[0, 1, 2], [0, 3, 4], [3, 4, 3]]), view)
     assert not np.isfinite(depth).any()
+
+
+@pytest.mark.parametrize("turn", [np.zeros((3, 3)), 2 * np.eye(3), np.diag([1.0, 1, 0.01])])
+def test_a_camera_that_does_not_turn_rigidly_is_told(turn):
+    pose = np.eye(4)
+    pose[:3, :3] = turn
+    with pytest.raises(InputError, match="does not turn rigidly"):
+        Camera(8, 8, np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]]), pose)
+
+
+def test_rays_that_begin_further_on_are_the_same_rays():
+    view = Camera(8, 8, np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]]), np.eye(4))
+    columns = rows = np.arange(8)
+    near, directions, cosine = view.rays(columns, rows)
+    far, again, same = view.rays(columns, rows, 32.0)
+    np.testing.assert_array_equal(again, directions)
+    np.testing.assert_array_equal(same, cosine)
+    np.testing.assert_allclose(far, near + 32 * directions, rtol=1e-6)

@@ -11,6 +11,7 @@ from pav_blender.core.errors import InputError
 from pav_blender.core.field.avatar import Avatar, read_header
 from pav_blender.core.field.directions import spherical_harmonics
 from pav_blender.core.field.field import Field, Samples, condition
+from pav_blender.core.field.limits import overflowing
 
 TINY = Config(
     levels=4,
@@ -264,3 +265,44 @@ def test_settings_survive_json_and_presets_are_checked():
         Config.preset("fastest")
     with pytest.raises(InputError, match="appearance"):
         Config(appearance="beard")
+
+
+def test_weights_that_may_overflow_are_named():
+    field = make_field()
+    assert overflowing(field) is None
+    for name, part in (
+        ("tables", "tables"),
+        ("latent", "latent"),
+        ("density.weights.0", "density"),
+        ("offset.weights.1", "offset"),
+        ("colour.biases.1", "colour"),
+    ):
+        for value in (3e38, float("nan"), float("inf")):
+            field = make_field()
+            with torch.no_grad():
+                field.state_dict()[name].view(-1)[0] = value
+            assert overflowing(field) == part, (name, value)
+
+
+def test_weights_that_do_not_overflow_are_finite_whatever_is_asked():
+    """Blown up as far as they may be, values of random samples stay finite."""
+    field, grown = make_field(), 1.0
+    while overflowing(field) is None:
+        with torch.no_grad():
+            for parameter in field.parameters():
+                parameter.mul_(2)
+        grown *= 2
+    with torch.no_grad():
+        for parameter in field.parameters():
+            parameter.div_(2)
+    assert grown > 1e3
+    density, colour = field(make_samples())
+    assert density.isfinite().all()
+    assert colour.isfinite().all()
+
+
+@pytest.mark.parametrize("name", ["step", "reach", "learning_rate", "density_bias", "beta1"])
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_settings_that_are_not_finite_are_named(name, value):
+    with pytest.raises(InputError, match=name):
+        Config.from_json({name: value})

@@ -3,7 +3,14 @@ import pytest
 
 from pav_blender.core.errors import InputError
 from pav_blender.core.files import replacing
-from pav_blender.core.images import read_gray, read_rgba, write_exr, write_gray, write_rgba
+from pav_blender.core.images import (
+    read_gray,
+    read_rgba,
+    read_scene_linear,
+    write_exr,
+    write_gray,
+    write_rgba,
+)
 
 
 @pytest.fixture
@@ -69,3 +76,14 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, pixels):
         fill()
     assert (tmp_path / "a.png").read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["a.png"]
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_pixels_that_are_not_finite_are_told(tmp_path, value):
+    rgba = np.full((5, 4, 4), 0.25, np.float32)
+    write_exr(tmp_path / "a.exr", rgba)
+    np.testing.assert_array_equal(read_scene_linear(tmp_path / "a.exr"), rgba)
+    rgba[1, 2, 0] = rgba[1, 2, 1] = rgba[4, 0, 3] = value
+    write_exr(tmp_path / "b.exr", rgba)
+    with pytest.raises(InputError, match=r"b\.exr: 2 pixels are not finite"):
+        read_scene_linear(tmp_path / "b.exr")

@@ -177,6 +177,8 @@ def test_moving_everything_moves_nothing_in_the_picture(toy_avatar, pose):
         ({"vertices": np.zeros((3, 3))}, "3 vertices"),
         ({"vertices": None}, "not finite"),
         ({"expression": np.zeros(3)}, "expression"),
+        ({"expression": np.full(52, np.nan)}, "expression 'browDownLeft' is nan"),
+        ({"expression": np.full(52, 3e38)}, "expression 'browDownLeft' is 3e.38"),
         ({"appearance": "bald"}, "unknown appearance 'bald'"),
         ({"appearance": {"plain": -1.0}}, "weights"),
         ({"appearance": {}}, "weights"),
@@ -292,3 +294,90 @@ def test_a_parallel_camera_is_a_pinhole_infinitely_far_away(toy_avatar, pose):
     assert psnr(over(one.rgba, 1.0), over(other.rgba, 1.0)) > 35
     seen = np.isfinite(one.depth) & np.isfinite(other.depth) & (other.rgba[..., 3] > 0.9)
     assert np.median(np.abs(one.depth[seen] - (away - 0.75) - other.depth[seen])) < 1e-3
+
+
+@pytest.mark.parametrize("unit", [1e-3, 0.0, 10.0, 1e4])
+def test_vertices_that_are_not_metres_are_told(toy_avatar, pose, unit):
+    """They would be a speck, or take all memory there is."""
+    with pytest.raises(InputError, match=r"m across.*vertices are metres"):
+        picture(toy_avatar, pose, vertices=pose["vertices"] * unit)
+
+
+def test_vertices_of_no_triangle_may_lie_anywhere(toy_avatar, pose):
+    from pav_blender.core.deformation import Deformer
+
+    canonical = np.concatenate([toy_avatar.canonical_vertices, np.zeros((2, 3), np.float32)])
+    posed = np.concatenate([pose["vertices"], np.full((2, 3), 1e6, np.float32)])
+    deformer = Deformer(canonical, toy_avatar.triangles, "smooth")
+    assert deformer.referenced.sum() == len(pose["vertices"])
+    assert deformer.pose(posed).vertices.abs().max() < 10
+    assert posed[-1, 0] == 1e6
+
+
+def test_far_from_the_origin_and_from_the_camera_is_as_near(toy_avatar, pose):
+    usual = picture(toy_avatar, pose)
+    shift = np.array([1e6, 2e6, -3e6])
+    away = picture(
+        toy_avatar,
+        pose,
+        vertices=pose["vertices"].astype(np.float64) + shift,
+        camera=pose["camera"].moved(shift),
+    )
+    np.testing.assert_allclose(away.rgba, usual.rgba, atol=2e-3)
+    back, pictures = pose["camera"].camera_to_world[:3, 2], []
+    for distance in (1e5, 1e7):
+        longer = pose["camera"].intrinsics.copy()
+        longer[[0, 1], [0, 1]] *= (distance + 0.75) / 0.75
+        camera = dataclasses.replace(pose["camera"].moved(-distance * back), intrinsics=longer)
+        pictures.append(picture(toy_avatar, pose, camera=camera))
+    assert (pictures[0].rgba[..., 3] > 0.9).mean() > 0.1
+    assert psnr(over(pictures[0].rgba, 1.0), over(pictures[1].rgba, 1.0)) > 50
+    seen = pictures[0].rgba[..., 3] > 0.9
+    assert np.abs(pictures[0].depth[seen] - 1e5 - 0.75).max() < 0.3
+
+
+def test_a_limit_is_where_it_says_however_far_the_camera(toy_avatar, pose):
+    scene = rendering.pose_scene(toy_avatar, pose["vertices"], "plain", pose["expression"])
+    longer = pose["camera"].intrinsics.copy()
+    longer[[0, 1], [0, 1]] *= 1000.75 / 0.75
+    back = pose["camera"].camera_to_world[:3, 2]
+    camera = dataclasses.replace(pose["camera"].moved(-1000 * back), intrinsics=longer)
+    whole = rendering.render_scene(scene, camera)
+    middle = np.float32(np.median(whole.depth[np.isfinite(whole.depth)]))
+    cut = rendering.render_scene(scene, camera, limit=np.full((64, 64), middle))
+    seen = np.isfinite(cut.depth)
+    assert (cut.depth[seen] <= middle + 1e-3).all()
+    assert 0.1 < seen.sum() / np.isfinite(whole.depth).sum() < 0.95
+
+
+def test_limits_that_do_not_fit_are_told(toy_avatar, pose):
+    scene = rendering.pose_scene(toy_avatar, pose["vertices"], "plain", pose["expression"])
+    with pytest.raises(InputError, match=r"limit: .*the picture is"):
+        rendering.render_scene(scene, pose["camera"], limit=np.zeros((64, 63)))
+    with pytest.raises(InputError, match=r"limit: .*not a number"):
+        rendering.render_scene(scene, pose["camera"], limit=np.full((64, 64), np.nan))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"step": 0.0}, {"step": -1.0}, {"step": np.nan}, {"step": 1.0}, {"step": 1e-9},
+        {"transmittance": np.nan}, {"tolerance": -0.1}, {"share": np.inf}, {"wave": 0},
+        {"chunk": 0}, {"probe": 0}, {"longest": -3}, {"negligible": np.nan},
+    ],
+)  # fmt: skip
+def test_settings_that_cannot_be_are_told(change):
+    with pytest.raises(InputError, match=next(iter(change))):
+        RenderSettings(**change)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 5), (4, 4), (17, 9), (64, 64), (5, 1)])
+def test_tiles_hold_every_pixel_once_and_neighbours_together(size):
+    from pav_blender.core.rendering.rays import TILE, tiled
+
+    width, height = size
+    order = tiled(width, height)
+    assert sorted(order.tolist()) == list(range(width * height))
+    row, column = np.divmod(order, width)
+    tile = row // TILE * -(-width // TILE) + column // TILE
+    assert (np.diff(tile) >= 0).all()

@@ -95,7 +95,7 @@ def _lattice(scene: Scene, spacing: float) -> tuple[np.ndarray, np.ndarray]:
     filled = ndimage.binary_dilation(np.pad(filled, margin), iterations=2)
     steps = int(len(filled) * voxel / spacing)
     at = ((np.arange(steps) + 0.5) * spacing / voxel).astype(int)
-    corner = scene.voxels.box_min.numpy() - margin * voxel + spacing / 2
+    corner = scene.origin + scene.voxels.box_min.numpy() - margin * voxel + spacing / 2
     return corner, filled[np.ix_(at, at, at)]
 
 

@@ -41,6 +41,10 @@ class Deformer:
             and not 0 <= int(self.triangles.min()) <= int(self.triangles.max()) < count
         ):
             raise InputError(f"triangles index vertices outside 0..{count - 1}")
+        # [V] bool: vertices of some triangle; others may lie anywhere
+        self.referenced = torch.zeros(count, dtype=torch.bool, device=device)
+        self.referenced[self.triangles.long().reshape(-1)] = True
+        self._loose = (~self.referenced).nonzero()[:, 0]
         self.kernels = select(device, reference=reference)
         self.topology = self.kernels.nearest.Topology(self.triangles, self.canonical_vertices)
 
@@ -54,6 +58,10 @@ class Deformer:
             raise InputError(
                 f"a pose has shape {tuple(posed.shape)}, the canonical mesh "
                 f"{tuple(self.canonical_vertices.shape)}: they must be the same mesh"
+            )
+        if len(self._loose) and len(self.triangles):  # they must not widen the mesh
+            posed = posed.index_copy(
+                0, self._loose, posed[self.triangles[0, :1].long()].expand(len(self._loose), 3)
             )
         search = self.kernels.nearest.refit(self.topology, posed)
         if self.mode == "smooth":

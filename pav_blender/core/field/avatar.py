@@ -19,6 +19,7 @@ from ..files import replacing
 from ..head import HeadModel, load_head
 from .field import Field
 from .identities import check_shapes, identity, read_identities
+from .limits import overflowing
 
 FORMAT = "pav-avatar"
 VERSION = 2
@@ -266,7 +267,7 @@ def _assemble(header: dict[str, Any], tensors: dict[str, torch.Tensor]) -> Avata
         tuple(str(name) for name in header["expression_names"]),
         rigid_weights=mesh["rigid_weights"],
         box_min=tensors["space.box_min"].numpy(),
-        box_size=float(header["box_size"]),
+        box_size=_size(header["box_size"]),
         occupied=bits.astype(bool).reshape(len(appearances), cells, cells, cells),
         head_name=str(header["head"]["name"]),
         head_fingerprint=str(header["head"]["fingerprint"]),
@@ -277,7 +278,16 @@ def _assemble(header: dict[str, Any], tensors: dict[str, torch.Tensor]) -> Avata
     )
     state = {k[6:]: v for k, v in tensors.items() if k.startswith("field.")}
     avatar.field.load_state_dict(state)
+    part = overflowing(avatar.field)
+    if part is not None:
+        raise InputError(f"the weights of {part!r} are so large that its values overflow float32")
     return avatar
+
+
+def _size(value: Any) -> float:
+    if not 0 < float(value) < np.inf:
+        raise InputError(f"box_size {value}: metres, above 0 and finite")
+    return float(value)
 
 
 def _check_indices(name: str, array: np.ndarray, limit: int) -> None:

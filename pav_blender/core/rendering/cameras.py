@@ -8,6 +8,8 @@ import numpy as np
 
 from ..errors import InputError
 
+_RIGID = 0.1  # how far a rotation may be off: files hold rounded ones
+
 
 @dataclass(frozen=True, eq=False)
 class Camera:
@@ -38,6 +40,9 @@ class Camera:
             raise InputError("camera: the focal lengths must be positive")
         if self.width < 1 or self.height < 1:
             raise InputError(f"camera: a picture of {self.width}x{self.height} pixels")
+        turn = pose[:3, :3]
+        if np.abs(turn.T @ turn - np.eye(3)).max() > _RIGID:
+            raise InputError("camera: camera_to_world does not turn rigidly; it must not scale")
         object.__setattr__(self, "intrinsics", intrinsics)
         object.__setattr__(self, "camera_to_world", pose)
 
@@ -56,10 +61,12 @@ class Camera:
         homogeneous = local @ self.intrinsics.T
         return homogeneous[:, :2] / safe[:, None], depth
 
-    def rays(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Pixel columns and rows [N] (integers: their centres) -> origins and unit directions
-        [N, 3] in the world and the cosine to the camera's axis [N] (depth = distance * cosine),
-        float32."""
+    def rays(
+        self, x: np.ndarray, y: np.ndarray, start: float = 0.0
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Pixel columns and rows [N] (integers: their centres) -> origins, `start` metres along,
+        and unit directions [N, 3] in the world and the cosine to the camera's axis [N] (depth =
+        distance * cosine), float32."""
         (fx, skew, cx), (_, fy, cy), _ = self.intrinsics
         v = (np.asarray(y, np.float64) + 0.5 - cy) / fy
         u = (np.asarray(x, np.float64) + 0.5 - cx - skew * v) / fx
@@ -72,6 +79,8 @@ class Camera:
             local = np.stack([u, v, np.ones_like(u)], axis=1)
             length = np.linalg.norm(local, axis=1)
         world = (local / length[:, None]) @ turn
+        if start:
+            origins = origins + start * world
         return (
             origins.astype(np.float32),
             world.astype(np.float32),
@@ -82,6 +91,12 @@ class Camera:
         """The same view with another number of pixels."""
         scale = np.diag([width / self.width, height / self.height, 1.0])
         return replace(self, width=width, height=height, intrinsics=scale @ self.intrinsics)
+
+    def moved(self, shift: np.ndarray) -> Camera:
+        """The camera carried off by `shift` [3], metres."""
+        pose = self.camera_to_world.copy()
+        pose[:3, 3] += shift
+        return replace(self, camera_to_world=pose)
 
     def window(self, x0: int, y0: int, x1: int, y1: int) -> Camera:
         """The camera of the pixels [x0, x1) x [y0, y1), top-left origin."""

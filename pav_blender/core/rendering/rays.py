@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 import torch
@@ -21,12 +20,14 @@ TILE = 4  # rays go together in squares of pixels: neighbours share triangles an
 @dataclass(eq=False)
 class RayBatch:
     """R rays: origins, directions [R, 3] (unit), cosine [R] (camera depth = t * cosine), end [R]:
-    metres along each after which nothing is seen, None for no end."""
+    metres along each after which nothing is seen, None for no end; start: metres from the camera to
+    the origins, that a depth begins with."""
 
     origins: torch.Tensor
     directions: torch.Tensor
     cosine: torch.Tensor
     end: torch.Tensor | None = None
+    start: float = 0.0
 
     def __len__(self) -> int:
         return len(self.cosine)
@@ -39,28 +40,38 @@ class RayBatch:
 
     def _each(self, change: Callable[[torch.Tensor], torch.Tensor]) -> RayBatch:
         end = None if self.end is None else change(self.end)
-        return RayBatch(change(self.origins), change(self.directions), change(self.cosine), end)
+        changed = change(self.origins), change(self.directions), change(self.cosine)
+        return RayBatch(*changed, end, self.start)
 
 
 def camera_rays(
-    camera: Camera, columns: np.ndarray, rows: np.ndarray, limit: np.ndarray | None = None
+    camera: Camera,
+    columns: np.ndarray,
+    rows: np.ndarray,
+    limit: np.ndarray | None = None,
+    start: float = 0.0,
 ) -> RayBatch:
     """Rays through the centres of pixels (columns [R], rows [R]); limit [R]: how far they see,
-    metres along the camera's axis."""
-    origins, directions, cosine = (torch.from_numpy(a) for a in camera.rays(columns, rows))
-    end = None if limit is None else torch.from_numpy(np.asarray(limit, np.float32)) / cosine
-    return RayBatch(origins, directions, cosine, end)
+    metres along the camera's axis; start: metres before which there is nothing to see."""
+    origins, directions, cosine = (torch.from_numpy(a) for a in camera.rays(columns, rows, start))
+    end = None
+    if limit is not None:
+        end = torch.from_numpy(np.asarray(limit, np.float32)) / cosine - start
+    return RayBatch(origins, directions, cosine, end, start)
 
 
-@lru_cache(maxsize=8)
 def tiled(width: int, height: int) -> np.ndarray:
     """Pixels [width * height] (row * width + column), tile after tile: neighbours search alike."""
-    pixels = np.arange(width * height)
-    row, column = pixels // width, pixels % width
-    tiles = (row // TILE * -(-width // TILE) + column // TILE) * TILE**2
-    order = np.argsort(tiles + row % TILE * TILE + column % TILE)
-    order.setflags(write=False)  # every caller has the same one
-    return order
+    bands, rest = divmod(height, TILE)
+    starts = np.arange(bands)[:, None] * (TILE * width)
+    last = _band(width, rest) + bands * TILE * width
+    return np.concatenate([(starts + _band(width, TILE)).reshape(-1), last])
+
+
+def _band(width: int, height: int) -> np.ndarray:
+    """The same of one row of tiles, `height` pixels high."""
+    row, column = np.divmod(np.arange(width * height), width)
+    return np.argsort(column // TILE * TILE**2 + row * TILE + column % TILE)
 
 
 @dataclass(eq=False)

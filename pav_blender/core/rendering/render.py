@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -27,6 +27,13 @@ from .rays import RayBatch, camera_rays, pack, samples_of, tiled
 from .wearing import Appearance, Wearing, deformer_of, wearing_of
 
 _FAR_WAVE = 24  # samples a ray between two looks, where every look waits for a device
+_FINEST, _COARSEST = 1e-5, 0.1  # metres between places
+# float32 counts micrometres up to some metres: what is far off is brought near, by whole strides so
+# that nothing changes where nothing is far
+_SHIFT = 64.0  # metres, of a mesh that is away from the origin
+_STRIDE = 16.0  # metres, of rays that come from afar
+_SMALLEST, _LARGEST = 1 / 8, 4.0  # times the canonical mesh: what a posed one may measure
+_MOST = 1e3  # the largest value of an expression; filmed ones are from 0 to 1
 
 
 @dataclass(frozen=True)
@@ -50,6 +57,17 @@ class RenderSettings:
     negligible: float = 0.5
     wave: int = 3
     chunk: int = 1 << 13
+
+    def __post_init__(self) -> None:
+        if not _FINEST <= self.step <= _COARSEST:
+            raise InputError(f"step {self.step}: metres, from {_FINEST:g} to {_COARSEST:g}")
+        for name in ("transmittance", "share", "tolerance", "negligible"):
+            value = getattr(self, name)
+            if not 0 <= value < np.inf:
+                raise InputError(f"{name} {value}: a finite number, 0 or more")
+        for name in ("longest", "probe", "wave", "chunk"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name} {getattr(self, name)}: at least 1")
 
     @classmethod
     def preset(cls, name: str) -> RenderSettings:
@@ -83,7 +101,8 @@ class Picture:
 
 @dataclass(eq=False)
 class Scene:
-    """An avatar in a pose, wearing something: what all rays of a picture share."""
+    """An avatar in a pose, wearing something: what all rays of a picture share. `origin` [3]
+    metres: where in the world the scene's own coordinates begin."""
 
     avatar: Avatar
     mesh: PosedMesh
@@ -91,6 +110,7 @@ class Scene:
     stance: Stance
     condition: torch.Tensor
     wearing: Wearing
+    origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
     @property
     def clearance(self) -> Clearance:
@@ -119,25 +139,51 @@ def pose_scene(
     appearance: Appearance,
     expression: np.ndarray | None = None,
 ) -> Scene:
-    """vertices [V, 3] metres, expression [E] (zeros if None). InputError for what does not fit."""
-    vertices = np.ascontiguousarray(vertices, np.float32)
+    """vertices [V, 3] metres, expression [E] (zeros if None). InputError for what does not fit.
+
+    float64 vertices may be as far from the world's origin as one likes.
+    """
+    vertices = np.asarray(vertices)
     if vertices.shape != avatar.canonical_vertices.shape:
         raise InputError(
             f"the mesh has {len(vertices)} vertices; this avatar was trained on a head with "
             f"{len(avatar.canonical_vertices)}"
         )
     if not np.isfinite(vertices).all():
-        raise InputError("the mesh has vertices that are not finite")
+        bad = np.flatnonzero(~np.isfinite(vertices).all(1))
+        raise InputError(
+            f"the mesh has {len(bad)} vertices that are not finite, the first is number {bad[0]}"
+        )
     count = len(avatar.expression_names)
     values = np.zeros(count, np.float32) if expression is None else np.asarray(expression)
-    if values.shape != (count,) or not np.isfinite(values).all():
-        raise InputError(f"expression: {values.shape} values; the avatar takes {count} finite ones")
+    if values.shape != (count,):
+        raise InputError(f"expression: {values.shape} values; the avatar takes {count}")
+    for name, value in zip(avatar.expression_names, values, strict=True):
+        if not abs(value) <= _MOST:
+            raise InputError(f"expression {name!r} is {value}: from {-_MOST:g} to {_MOST:g}")
+    deformer = deformer_of(avatar)
+    used = deformer.referenced.numpy()
+    canonical = avatar.canonical_vertices[used]
+    _check_size(canonical, vertices[used])
+    origin = np.round(vertices[used].mean(0, dtype=np.float64) / _SHIFT) * _SHIFT
+    vertices = np.ascontiguousarray(vertices - origin, np.float32)
     wearing = wearing_of(avatar, appearance)
-    stands = stance(avatar.canonical_vertices, vertices, avatar.rigid_weights)
-    mesh = deformer_of(avatar).pose(vertices)
+    stands = stance(canonical, vertices[used], avatar.rigid_weights[used])
+    mesh = deformer.pose(vertices)
     filled = voxels(mesh, wearing.space, avatar.config.reach)
     seen = condition(avatar.config, values.astype(np.float32), stands.turn, wearing.person)
-    return Scene(avatar, mesh, filled, stands, seen, wearing)
+    return Scene(avatar, mesh, filled, stands, seen, wearing, origin)
+
+
+def _check_size(canonical: np.ndarray, posed: np.ndarray) -> None:
+    """InputError unless a posed mesh is about as large as the canonical one: what a step along a
+    ray is, and how much memory a pose takes, goes by metres."""
+    size, usual = (float(np.ptp(vertices, 0).max()) for vertices in (posed, canonical))
+    if not _SMALLEST * usual <= size <= _LARGEST * usual:
+        raise InputError(
+            f"the posed mesh is {size:.3g} m across, the avatar's head {usual:.3g} m; from "
+            f"{_SMALLEST:g} to {_LARGEST:g} times as much can be drawn: vertices are metres"
+        )
 
 
 def render(
@@ -177,9 +223,18 @@ def render_scene(
     """Renders an avatar that `pose_scene` posed, as often as one likes.
 
     limit [H, W]: how far each pixel sees, metres along the camera's axis: what lies behind is
-    neither looked at nor shown. Raises Cancelled when `should_stop()`.
+    neither looked at nor shown. Raises Cancelled when `should_stop()`, InputError for a limit that
+    does not fit.
     """
     settings = settings or RenderSettings()
+    if limit is not None and np.shape(limit) != (camera.height, camera.width):
+        raise InputError(
+            f"limit: {np.shape(limit)}; the picture is {(camera.height, camera.width)}"
+        )
+    if limit is not None and np.isnan(limit).any():
+        raise InputError("limit: some pixels see as far as what is not a number")
+    camera = camera.moved(-scene.origin)
+    before = _before(scene, camera)
     caller, done, evaluations = threading.get_ident(), 0, 0
     counting = threading.Lock()
     limits = None if limit is None else np.asarray(limit, np.float32).reshape(-1)
@@ -199,7 +254,8 @@ def render_scene(
                 raise Cancelled("rendering was cancelled")
             pixels = order[start:stop]
             far = None if limits is None else limits[pixels]
-            rays = camera_rays(camera, pixels % camera.width, pixels // camera.width, far)
+            rows, columns = np.divmod(pixels, camera.width)
+            rays = camera_rays(camera, columns, rows, far, before)
             with torch.inference_mode():
                 rgba[pixels], depth[pixels], evaluated = _trace(scene, rays, settings)
             with counting:
@@ -220,6 +276,8 @@ def trace_rays(
     """Straight sRGB with alpha [R, 4] and depth along the cosine's axis [R] (inf if empty) of any
     rays, on all threads."""
     chosen = settings or RenderSettings()
+    if scene.origin.any():
+        rays = replace(rays, origins=rays.origins - torch.from_numpy(scene.origin).float())
     rgba, depth = np.zeros((len(rays), 4), np.float32), np.full(len(rays), np.inf, np.float32)
 
     def trace(start: int, stop: int) -> None:
@@ -230,6 +288,18 @@ def trace_rays(
     with torch.inference_mode(), torch_alone():
         run_chunks(trace, len(rays), chosen.chunk)
     return rgba, depth
+
+
+def _before(scene: Scene, camera: Camera) -> float:
+    """How far along every ray of a camera there is nothing yet, in whole strides."""
+    box = scene.mesh.vertices.numpy().astype(np.float64)
+    low, high = box.min(0), box.max(0)
+    radius = np.linalg.norm(high - low) / 2 + scene.avatar.config.reach * np.sqrt(3)
+    towards = (low + high) / 2 - camera.origin
+    distance = towards @ camera.camera_to_world[:3, 2]
+    if not camera.parallel:
+        distance = np.linalg.norm(towards)
+    return _STRIDE * max(0.0, np.floor((distance - radius) / _STRIDE))
 
 
 def _trace(
@@ -246,7 +316,7 @@ def _trace(
     # a ray that was ended early is opaque: what is left of it would be seen through nothing
     alpha = torch.where(left <= settings.transmittance, 1.0, opacity).clamp(0, 1)
     rgba = torch.where(seen[:, None], torch.cat([straight, alpha[:, None]], 1), 0.0)
-    along = torch.where(seen, depth / safe[:, 0] * rays.cosine, torch.inf)
+    along = torch.where(seen, (depth / safe[:, 0] + rays.start) * rays.cosine, torch.inf)
     return rgba.numpy(), along.numpy(), evaluations
 
 

@@ -10,15 +10,21 @@ import safetensors
 import safetensors.torch
 import torch
 
-from ..errors import InputError
+from ..errors import InputError, PavError
 from ..files import replacing
 from .trainer import Status, Trainer
 
 FORMAT = "pav-checkpoint"
+_RETURNS = 3  # a training that goes astray more often than that does so whatever the batches are
 
 
-def save_checkpoint(path: Path, trainer: Trainer, source: str) -> None:
-    """Writes the whole state of `trainer`; `source` says which data it was learning from."""
+def save_checkpoint(path: Path, trainer: Trainer, source: str) -> bool:
+    """Writes the whole state of `trainer`; `source` says which data it was learning from.
+
+    Of one that went astray nothing is written, and the checkpoint that is there stays: False.
+    """
+    if not trainer.sound():
+        return False
     tensors: dict[str, torch.Tensor] = {
         f"field.{name}": value for name, value in trainer.avatar.field.state_dict().items()
     }
@@ -40,6 +46,7 @@ def save_checkpoint(path: Path, trainer: Trainer, source: str) -> None:
         "pools": [[group, pool] for group, pool in trainer.pools.items()],
         "random": trainer.random.bit_generator.state,
         "refinement": refinement,
+        "watch": trainer.watch.state(),
     }
     with replacing(path) as temporary:
         safetensors.torch.save_file(
@@ -47,6 +54,26 @@ def save_checkpoint(path: Path, trainer: Trainer, source: str) -> None:
             temporary,
             {"pav": json.dumps(header)},
         )
+    return True
+
+
+def go_back(path: Path, trainer: Trainer, source: str, times: int) -> None:
+    """Puts a `trainer` that went astray where its last checkpoint left off, to go on with other
+    batches; it is for the `times`-th time. Raises PavError where there is no way back."""
+    status, skipped = trainer.status, trainer.watch.skipped
+    where = f"training went astray at iteration {status.iteration} (loss {status.loss:.3g})"
+    if not path.is_file():
+        raise PavError(f"{where}, before there was a checkpoint: lower the learning rates")
+    if times > _RETURNS:
+        raise PavError(
+            f"{where}, for the {times}th time: lower the learning rates, or look at the collection "
+            f"with `pav check`; {path} is from before that"
+        )
+    trainer.visibility.spaces.clear()  # cells that were emptied since are filled again
+    load_checkpoint(path, trainer, source)
+    trainer.status.seconds = status.seconds
+    trainer.watch.skipped = skipped
+    trainer.other_batches(times)
 
 
 def load_checkpoint(path: Path, trainer: Trainer, source: str) -> None:
@@ -80,6 +107,7 @@ def load_checkpoint(path: Path, trainer: Trainer, source: str) -> None:
         trainer.random.bit_generator.state = header["random"]
         trainer.pools = {int(group): list(pool) for group, pool in header["pools"]}
         trainer.status = Status(**header["status"])
+        trainer.watch.restore(header.get("watch", {}))
         if trainer.refiner is not None:
             named = {k[10:]: v for k, v in tensors.items() if k.startswith("corrected.")}
             trainer.refiner.restore(named, header["refinement"])

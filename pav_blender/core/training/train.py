@@ -15,7 +15,7 @@ from ..errors import Cancelled, InputError
 from ..field.avatar import Avatar
 from ..kernels.cpu.threads import torch_alone
 from ..progress import Report
-from .checkpoint import load_checkpoint, save_checkpoint
+from .checkpoint import go_back, load_checkpoint, save_checkpoint
 from .people import People
 from .places import checkpoint_path
 from .prepare import load_training_frames, new_avatar
@@ -52,6 +52,10 @@ def train(
     `config.refine_poses` is on, the folder for the collection with its track corrected. preview:
     a folder for pictures of how it is going (`.preview`). Raises Cancelled (the checkpoint stays)
     when `should_stop()`, InputError for bad input.
+
+    Batches whose loss is far above the usual, or not finite, are not learned from. Where that goes
+    on, or the weights are no longer finite, training goes back to its checkpoint and on from there
+    with other batches; PavError where that does not help.
     """
     if not isinstance(collection, Collection | People):
         collection = read_collection(collection)
@@ -81,8 +85,12 @@ def train(
     if resume:
         load_checkpoint(saved, trainer, source)
     shown = None if preview is None else Preview(preview, collection, trainer)
-    last_saved = time.monotonic()
-    while trainer.done < 1:
+    last_saved, returns, lost = time.monotonic(), 0, False
+    while trainer.done < 1 or not trainer.sound():
+        if lost or trainer.watch.astray or trainer.done >= 1:
+            returns, lost = returns + 1, False
+            go_back(saved, trainer, source, returns)
+            continue
         with torch_alone():
             status = trainer.iterate()
         if progress:
@@ -97,10 +105,12 @@ def train(
             shown(status, last=trainer.done >= 1)
         stopping = should_stop is not None and should_stop()
         if stopping or time.monotonic() - last_saved >= checkpoint_every:
-            save_checkpoint(saved, trainer, source)
+            lost = not save_checkpoint(saved, trainer, source)
             if shown is not None:
                 shown.keep_curve()
             last_saved = time.monotonic()
+        if stopping and not saved.is_file():
+            raise Cancelled("training was stopped when it had gone astray: nothing was kept")
         if stopping:
             raise Cancelled(f"training was stopped; `--resume` goes on from {saved}")
     if refined is not None and refiner is not None:
@@ -116,6 +126,8 @@ def train(
         "batch_psnr": round(trainer.status.psnr, 2),
         **({} if shown is None or resume else {"preview_seconds": round(shown.seconds, 1)}),
         "collection": source,
+        **({"skipped_batches": trainer.watch.skipped} if trainer.watch.skipped else {}),
+        **({"returns": returns} if returns else {}),
     }
     avatar.save(out)
     saved.unlink(missing_ok=True)

@@ -16,6 +16,7 @@ from ..deformation import Deformer
 from ..field.avatar import Avatar
 from ..field.field import Samples, condition
 from ..field.identities import codes
+from ..field.limits import overflowing
 from ..rendering.render import Scene
 from ..rendering.wearing import Wearing
 from .attention import Attention
@@ -23,6 +24,7 @@ from .batches import KEPT_POSES, Poses, draw_pixels, pick_samples
 from .frames import Frame, halved
 from .losses import Loss, distortion, losses
 from .occupancy import Visibility
+from .watch import Watch
 
 _FIRST_STEP = 8.0  # the first samples are this many times as far apart as the last
 _LOOKS_A_RAY = 40  # the step is as fine as this many looks a ray allow
@@ -38,6 +40,7 @@ _COARSE = (0.4, 0.15)
 _ENDED = 0.01  # transmittance at which a ray may be ended
 _PRUNE_FROM = 0.15
 _RENEWED = 1 / 16  # chance that a frame drawn is one that was not in use
+_SMALL_ERROR = 1e-3  # mean squared error of a batch that is never a spike: 30 dB
 
 
 @dataclass
@@ -108,6 +111,7 @@ class Trainer:
         # what makes of frames drawn from whole pictures those that are learned from
         self.refiner: Refines | None = None
         self._mse = math.nan
+        self.watch = Watch(floor=self.config.colour_weight * _SMALL_ERROR)
 
     @property
     def done(self) -> float:
@@ -148,9 +152,10 @@ class Trainer:
         # what lies behind where a ray was ended by mistake must not be laid to what is before it
         counted = ~picked.ended.to(self.device) | (opacity.detach() > 1 - _ENDED)
         loss = losses(config, pixels, background, colour, opacity, depth, counted)
-        if torch.isfinite(loss.total):
-            spread = distortion(weights, t, samples.ray, count)
-            (loss.total + config.distortion_weight * spread).backward()
+        total = loss.total + config.distortion_weight * distortion(weights, t, samples.ray, count)
+        takes = self.watch.takes(float(total.detach()))
+        if takes:
+            total.backward()
             self._adam(samples, encoded)
             squared = loss.squared.mean(1).cpu().numpy()
             self.attention.note(pixels.frames, pixels.starts, pixels.tile, squared)
@@ -159,10 +164,25 @@ class Trainer:
         status.iteration += 1
         if self._prunes_now():
             status.filled = self.visibility.prune()
-        self._note(loss, len(picked.t) / max(count, 1))
+        if takes:
+            self._note(loss, len(picked.t) / max(count, 1))
         self._plan(picked.looks / max(count, 1))
         status.seconds += time.monotonic() - started
         return status
+
+    def sound(self) -> bool:
+        """Whether the weights can be drawn and learned from, and the loss is not far above what it
+        was."""
+        if self.watch.astray or overflowing(self.avatar.field) is not None:
+            return False
+        moments = (values for pair in self.moments.values() for values in pair)
+        return all(bool(torch.isfinite(values).all()) for values in moments)
+
+    def other_batches(self, which: int) -> None:
+        """Goes on from here with other random numbers: the same ones led astray."""
+        self.random = np.random.default_rng([self.config.seed, which])
+        self.generator.manual_seed(self.config.seed + which)
+        self.watch.begin_anew()
 
     def learn_from(self, frames: list[Frame]) -> None:
         """Takes in more frames of appearances that are there, once pictures are whole."""
