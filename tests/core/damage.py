@@ -196,7 +196,7 @@ def of_tensors(whole: bytes, rng: random.Random) -> bytes:
     header, data = json.loads(whole[8 : 8 + size]), whole[8 + size :]
     match rng.randrange(5):
         case 0:
-            return struct.pack("<Q", rng.choice(NUMBERS)) + whole[8:]
+            return struct.pack("<Q", rng.choice(NUMBERS) & ((1 << 64) - 1)) + whole[8:]
         case 1:
             raw = rng.choice((DEEP, '{"__metadata__":' + DEEP, "{}", "null", '{"a":1,"a":2}'))
         case 2:
