@@ -51,10 +51,14 @@ def unpacked(text: Any) -> Path:
     if not re.fullmatch("[0-9a-f]{64}", digest) or text.get(_BYTES) is None:
         raise InputError(f"the text {text.name!r} holds no packed avatar; choose the file again")
     folder = Path(bpy.app.tempdir) / "pav" / digest
-    path = folder / (re.sub(r"[^\w.-]", "_", Path(name).name).lstrip(".") or "packed.pav")
+    # it may be written beside a .blend that came from elsewhere: as an avatar, and nothing else
+    stem = re.sub(r"[^\w.-]", "_", Path(name).name).lstrip(".")[:100].removesuffix(".pav")
+    path = folder / f"{stem or 'packed'}.pav"
     if path.is_file():  # whole: it was given its name last
         return path
-    data = bytes(text[_BYTES])
+    stored = text[_BYTES]
+    # bytes of a number would be as many zeros
+    data = stored if isinstance(stored, bytes) else b""
     if hashlib.sha256(data).hexdigest() != digest:
         raise InputError(f"the avatar packed in the text {text.name!r} is damaged")
     with replacing(path) as temporary:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 import bpy
 
 from ..core.errors import PavError
+from ..core.reading import read_json
 from . import avatars, thumbnails, training_properties
 from .frame_settings import PavFrames
 from .training_properties import PavTraining
@@ -49,9 +49,9 @@ def clip_names(self: Any, _context: Any, edit_text: str) -> list[str]:
     """Clips of the chosen collection whose name contains what was typed."""
     try:
         folder = avatars.resolve(self.collection)
-        known = json.loads((folder / "collection.json").read_text(encoding="utf-8"))["clips"]
+        known = read_json(folder / "collection.json")["clips"]
         names = [str(clip["name"]) for clip in known]
-    except (PavError, OSError, ValueError, KeyError, TypeError):
+    except (PavError, KeyError, TypeError):
         return []
     return [name for name in names if edit_text.lower() in name.lower()]
 

@@ -15,6 +15,7 @@ from typing import Any
 
 from ..core.errors import InputError
 from ..core.files import write_text
+from ..core.reading import read_json
 from ..core.training.places import checkpoint_path, read_curve
 from . import packages, requirements
 from .pipeline import Phase, Pipeline
@@ -96,7 +97,7 @@ def read_note(output: Path) -> Wanted:
     """
     path = note_of(output)
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path)
         if content["format"] != FORMAT:
             raise ValueError(content["format"])
         collection = content["collection"]
@@ -106,7 +107,7 @@ def read_note(output: Path) -> Wanted:
             "minutes": float(content["minutes"]),
             "options": str(content["options"]),
         }
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (InputError, ValueError, KeyError, TypeError, OverflowError) as error:
         raise InputError(f"{path}: not the note of a training; discard it") from error
     return Wanted(output, clips, **values)
 
@@ -193,12 +194,12 @@ def tracked(wanted: Wanted) -> bool:
         return False
     try:
         made = (folder / "collection.json").stat().st_mtime
-        content = json.loads((folder / "collection.json").read_text(encoding="utf-8"))
+        content = read_json(folder / "collection.json")
         looks = {clip["name"]: clip["appearance"] for clip in content["clips"]}
         tracking = content["extra"]["tracking"]
         videos = {clip["video"] for clip in tracking["clips"] + tracking["skipped"]}
         pairs = {(clip["video"], looks[clip["name"]]) for clip in tracking["clips"]}
-    except (OSError, ValueError, KeyError, TypeError):
+    except (InputError, OSError, KeyError, TypeError):
         videos, pairs, made = set(), set(), 0.0
     same = {(path.name, name.strip()) for path, name in wanted.clips}
     newer = any(path.stat().st_mtime > made for path, _ in wanted.clips)

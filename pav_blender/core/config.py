@@ -11,6 +11,27 @@ from .errors import InputError
 
 APPEARANCE_MODES = ("vertex", "surface", "global", "none")
 FRAME_MODES = ("smooth", "affine", "rigid")
+# from, to: what a file of settings may ask for before anything is made of that size
+_LIMITS = {
+    "levels": (1, 64),
+    "log2_entries": (3, 24),
+    "base_resolution": (1, 1 << 16),
+    "finest_resolution": (1, 1 << 16),
+    "shoulder_levels": (0, 64),
+    "latent_channels": (0, 1024),
+    "latent_size": (1, 8192),
+    "global_channels": (0, 1 << 16),
+    "hidden": (1, 4096),
+    "geometry_channels": (1, 4096),
+    "density_layers": (0, 64),
+    "offset_layers": (0, 64),
+    "colour_layers": (0, 64),
+    "occupancy_resolution": (1, 1024),
+    "iterations": (1, 1 << 40),
+    "rays": (1, 1 << 24),
+    "frames_per_batch": (1, 1 << 16),
+    "seed": (0, (1 << 63) - 1),
+}
 
 
 @dataclass(frozen=True)
@@ -88,15 +109,18 @@ class Config:
             raise InputError(f"appearance {self.appearance!r}: one of {APPEARANCE_MODES}")
         if self.frames not in FRAME_MODES:
             raise InputError(f"frames {self.frames!r}: one of {FRAME_MODES}")
-        for name in ("levels", "hidden", "rays", "iterations", "frames_per_batch"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name} must be at least 1, not {getattr(self, name)}")
-        if not 3 <= self.log2_entries <= 24:
-            raise InputError(f"log2_entries {self.log2_entries}: from 3 to 24")
+        for name, (low, high) in _LIMITS.items():
+            if not low <= getattr(self, name) <= high:
+                raise InputError(f"{name} {getattr(self, name)}: from {low} to {high}")
         for setting in dataclasses.fields(self):
             value = getattr(self, setting.name)
             if isinstance(value, float) and not math.isfinite(value):
                 raise InputError(f"{setting.name} must be a finite number, not {value}")
+        if self.finest_resolution < self.base_resolution:
+            raise InputError(
+                f"finest_resolution {self.finest_resolution}: not below base_resolution "
+                f"{self.base_resolution}"
+            )
         for name in ("step", "reach"):
             if not getattr(self, name) > 0:
                 raise InputError(f"{name} {getattr(self, name)}: metres, above 0")
@@ -150,10 +174,16 @@ class Config:
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> Config:
         """The reverse of to_json; InputError for a setting this program does not know."""
+        if not isinstance(values, dict):
+            raise InputError("the settings are missing")
         known = {f.name: type(f.default) for f in dataclasses.fields(cls)}
         for name, value in values.items():
             if name not in known:
-                raise InputError(f"unknown setting {name!r}; was it written by a newer version?")
+                raise InputError(
+                    f"unknown setting {name[:80]!r}; was it written by a newer version?"
+                )
             if known[name] is not type(value) and not (known[name] is float and type(value) is int):
-                raise InputError(f"setting {name!r} is {value!r}; expected {known[name].__name__}")
+                raise InputError(
+                    f"setting {name!r} is {value!r:.80}; expected {known[name].__name__}"
+                )
         return cls(**values)

@@ -1,4 +1,4 @@
-"""Writing so that a final name never holds half a file."""
+"""Writing so that a final name never holds half a file, and only where it was meant to go."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from pathlib import Path
 from .errors import InputError
 
 _lock = threading.Lock()
+# names of devices on Windows
+_RESERVED = {"CON", "PRN", "AUX", "NUL", *(f"{n}{i}" for n in ("COM", "LPT") for i in range(1, 10))}
 
 
 @contextlib.contextmanager
@@ -61,6 +63,18 @@ def new_folder(path: Path | str) -> Iterator[Path]:
         temporary.rename(path)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def check_folder_name(name: str, what: str) -> str:
+    """Returns `name`, or raises InputError where it could not name a folder: a picture's path may
+    be made of it, and then it must not lead anywhere else."""
+    fits = 0 < len(name) <= 100 and name.isprintable() and not set(name) & set('/\\:*?"<>|')
+    if not fits or name != name.strip(" .") or name.upper() in _RESERVED:
+        raise InputError(
+            f"{what} {name[:100]!r} cannot name a folder: use no / \\ : * ? \" < > |, no '.' or "
+            "space at its ends, and at most 100 characters"
+        )
+    return name
 
 
 def write_text(path: Path | str, text: str) -> None:

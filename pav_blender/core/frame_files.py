@@ -20,6 +20,7 @@ SUFFIXES = {".png", ".exr", ".jpg", ".jpeg", ".tif", ".tiff", ".tga", ".bmp", ".
 _NUMBERED = re.compile(r"(?P<stem>.*?)(?P<number>\d+)(?P<suffix>\.[A-Za-z]+)")
 # as `files.replacing` and the rendering of a .blend name what they have not finished
 _LEFT_FILE = re.compile(r"\..+\.partial-\w+(?P<suffix>\.\w+)")
+_LONGEST = 1_000_000  # frames of a range
 _LEFT_FOLDER = re.compile(r"\.partial-\w+")
 
 
@@ -62,6 +63,11 @@ def look(folder: Path, span: tuple[int, int] | None = None) -> FrameFiles:
             good.add(number)
     if span is None and numbers:
         span = min(numbers), max(numbers)
+    if span is not None and span[1] - span[0] >= _LONGEST:
+        raise InputError(
+            f"{folder}: pictures numbered from {span[0]} to {span[1]}; at most {_LONGEST} are "
+            "looked for: say with --range which ones should be there"
+        )
     if span is not None:
         found.missing = [n for n in range(span[0], span[1] + 1) if n not in good]
     return found

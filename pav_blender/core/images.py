@@ -11,8 +11,12 @@ import numpy as np
 
 from .errors import InputError
 from .files import replacing
+from .reading import check_unpacked, file_size, first_line
 
 _NONE, _AVERAGE = 8, 64  # libpng's names for a row's filter
+_UNPACKED = 1 << 30  # bytes that the pixels of any file may take: 8K in half floats with depth
+_LARGEST_SIDE = 65536
+_FORMATS = ("png", "jpeg", "tiff", "openexr", "hdr", "targa", "bmp", "webp", "pnm")
 
 
 def _oiio() -> ModuleType:
@@ -24,17 +28,38 @@ def _oiio() -> ModuleType:
         ) from error
 
 
-def _read(path: Path | str, formats: str) -> np.ndarray:
+def _open(path: Path | str) -> Any:
+    """OpenImageIO's reader of a picture, after a look at its head."""
     oiio = _oiio()
-    path = Path(path)
-    if not path.is_file():
+    if not Path(path).is_file():
         raise InputError(f"{path}: no such picture")
     # associated alpha would multiply the colours of a straight-alpha PNG on reading
     config = oiio.ImageSpec()
     config.attribute("oiio:UnassociatedAlpha", 1)
     source = oiio.ImageInput.open(str(path), config)
     if source is None:
-        raise InputError(f"{path}: not a readable picture ({oiio.geterror().strip()})")
+        raise InputError(f"{path}: not a readable picture ({first_line(oiio.geterror())})")
+    try:
+        if source.format_name() not in _FORMATS:
+            raise InputError(f"{path}: a picture of the kind {source.format_name()} is not read")
+        _check_size(path, source.spec())
+    except InputError:
+        source.close()
+        raise
+    return source
+
+
+def _check_size(path: Path | str, spec: Any) -> None:
+    """InputError for more pixels than a file of its size holds: before memory is taken for them."""
+    sides = spec.width, spec.height
+    if not (min(sides) > 0 and max(sides) <= _LARGEST_SIDE and spec.nchannels > 0):
+        raise InputError(f"{path}: a picture of {sides[0]}x{sides[1]} pixels")
+    needed = sides[0] * sides[1] * max(1, spec.depth) * spec.nchannels * spec.channel_bytes()
+    check_unpacked(path, max(needed, spec.image_bytes(True)), file_size(path), _UNPACKED)
+
+
+def _read(path: Path | str, formats: str) -> np.ndarray:
+    source = _open(path)
     try:
         native = source.spec().format
         kind = formats if formats != "native" else str(native)
@@ -43,13 +68,8 @@ def _read(path: Path | str, formats: str) -> np.ndarray:
     finally:
         source.close()
     if pixels is None or problem:
-        raise InputError(f"{path}: the picture is damaged ({_first_line(problem)})")
+        raise InputError(f"{path}: the picture is damaged ({first_line(problem)})")
     return np.asarray(pixels)
-
-
-def _first_line(text: str) -> str:
-    lines = text.strip().splitlines()
-    return lines[0] if lines else "no pixels"
 
 
 def read_rgba(path: Path | str) -> np.ndarray:
@@ -92,17 +112,15 @@ def read_scene_linear(path: Path | str) -> np.ndarray:
 
 def check(path: Path | str) -> None:
     """Reads a picture, every part of it, to its end. InputError for a missing or damaged file."""
-    oiio = _oiio()
-    source = oiio.ImageInput.open(str(path)) if Path(path).is_file() else None
-    if source is None:
-        raise InputError(f"{path}: not a readable picture ({_first_line(oiio.geterror())})")
+    source = _open(path)
     try:
         part = 0
         while source.seek_subimage(part, 0):
+            _check_size(path, source.spec())
             channels = source.spec().nchannels
             pixels = source.read_image(part, 0, 0, channels, str(source.spec().format))
             if pixels is None or source.has_error:
-                problem = _first_line(source.geterror())
+                problem = first_line(source.geterror())
                 raise InputError(f"{path}: the picture is damaged ({problem})")
             part += 1
         source.geterror()  # that there is no further part
@@ -112,10 +130,7 @@ def check(path: Path | str) -> None:
 
 def read_metadata(path: Path | str) -> dict[str, str]:
     """The texts that a picture carries, by name. InputError where its head cannot be read."""
-    oiio = _oiio()
-    source = oiio.ImageInput.open(str(path)) if Path(path).is_file() else None
-    if source is None:
-        raise InputError(f"{path}: not a readable picture ({_first_line(oiio.geterror())})")
+    source = _open(path)
     try:
         return {item.name: str(item.value) for item in source.spec().extra_attribs}
     finally:

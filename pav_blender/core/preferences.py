@@ -12,7 +12,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from .errors import InputError
 from .files import write_text
+from .reading import read_json
 
 _NAME = "preferences.json"
 
@@ -32,22 +34,19 @@ def folder() -> Path:
 
 def read(section: str) -> dict[str, Any]:
     """A section of the preferences; empty where there is none or the file is damaged."""
-    try:
-        content = json.loads((folder() / _NAME).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    found = content.get(section) if isinstance(content, dict) else None
+    found = _content().get(section)
     return dict(found) if isinstance(found, dict) else {}
 
 
 def write(section: str, values: dict[str, Any]) -> Path:
     """Replaces a section; returns the file. Raises InputError where it cannot be written."""
     path = folder() / _NAME
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        content = {}
-    content = content if isinstance(content, dict) else {}
-    content[section] = values
-    write_text(path, json.dumps(content, indent=1) + "\n")
+    write_text(path, json.dumps({**_content(), section: values}, indent=1) + "\n")
     return path
+
+
+def _content() -> dict[str, Any]:
+    try:
+        return read_json(folder() / _NAME)
+    except InputError:
+        return {}

@@ -48,7 +48,7 @@ class Steps:
         self._path = path
         self.seconds: dict[str, float] = {}
         if path.is_file():
-            self.seconds = json.loads(path.read_text(encoding="utf-8"))
+            self.seconds = _seconds(path)
 
     @contextmanager
     def time(self, name: str) -> Iterator[None]:
@@ -59,6 +59,15 @@ class Steps:
 
         self.seconds[name] = round(time.monotonic() - started, 1)
         write_text(self._path, json.dumps(self.seconds))
+
+
+def _seconds(path: Path) -> dict[str, float]:
+    from ..core.reading import read_json
+
+    stored = read_json(path)
+    if not all(isinstance(value, int | float) and 0 <= value < 1e9 for value in stored.values()):
+        raise InputError(f"{path}: not the seconds of a demo's steps; add --fresh to begin anew")
+    return stored
 
 
 def run(args: argparse.Namespace) -> int:

@@ -111,5 +111,5 @@ def test_missing_truncated_foreign_and_pickled_files(tmp_path):
         with pytest.raises(InputError, match=r"head\.npz"):
             read_head(path)
     np.savez(path, format=np.array([{"not": "plain"}], dtype=object))
-    with pytest.raises(InputError, match="not a readable head file"):
+    with pytest.raises(InputError, match="holds pickled objects"):
         read_head(path)

@@ -95,7 +95,7 @@ def test_a_pickled_npz_is_refused(tmp_path, make):
     make(formats.write_vhap, tmp_path / "v")
     evil = np.array([Run(f"touch {tmp_path / 'ran'}")], dtype=object)
     np.savez(tmp_path / "v/flame_param/00001.npz", shape=evil)
-    with pytest.raises(InputError, match=r"00001\.npz: damaged, or it holds pickled objects"):
+    with pytest.raises(InputError, match=r"00001\.npz: .*it holds pickled objects"):
         read_sources([str(tmp_path / "v")])
     assert not (tmp_path / "ran").exists()
 

@@ -111,7 +111,10 @@ class Collection:
         return self._picture("labels", clip, row)
 
     def _picture(self, kind: str, clip: Clip, row: int) -> Path:
-        return self.path / "clips" / clip.name / kind / f"{clip.frame_id[row]:06d}.png"
+        path = self.path / "clips" / clip.name / kind / f"{clip.frame_id[row]:06d}.png"
+        if not path.resolve().is_relative_to(self.path.resolve()):
+            raise InputError(f"{path}: a link that leads out of the collection; it is not read")
+        return path
 
     def posed(self, clip: Clip, rows: np.ndarray) -> np.ndarray:
         """Vertices of the tracked mesh, [len(rows), V, 3] float32 metres."""

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-import json
-import zipfile
 from pathlib import Path
 
 import numpy as np
 
 from ..errors import InputError
+from ..files import check_folder_name
 from ..head import HeadModel, load_head
+from ..reading import read_arrays, read_json
 from .model import FORMAT, SPLITS, VERSION, Clip, Collection
 from .writer import OFFSET_FILE, check_name
 
 _LARGEST_SIDE = 16384
+_ARRAYS = (
+    "expression", "pose", "translation", "intrinsics", "camera_to_world", "frame_id", "split",
+    "vertices", "landmarks",
+)  # fmt: skip
 
 
 def read_collection(path: Path | str) -> Collection:
@@ -27,11 +31,8 @@ def read_collection(path: Path | str) -> Collection:
         raise InputError(f"{path}: no such collection folder")
     if not meta_path.is_file():
         raise InputError(f"{path}: not a collection (it has no collection.json)")
-    try:
-        meta = json.loads(meta_path.read_text(encoding="utf-8"))
-    except (ValueError, OSError) as error:
-        raise InputError(f"{meta_path}: not readable as JSON ({error})") from error
-    if not isinstance(meta, dict) or meta.get("format") != FORMAT:
+    meta = read_json(meta_path)
+    if meta.get("format") != FORMAT:
         raise InputError(f"{meta_path}: not a collection file (its format is not {FORMAT!r})")
     if meta.get("version") != VERSION:
         raise InputError(
@@ -45,13 +46,14 @@ def read_collection(path: Path | str) -> Collection:
         entries = [
             (
                 check_name(str(entry["name"]), "clip name"),
-                str(entry["appearance"]),
+                check_folder_name(str(entry["appearance"]), "appearance"),
                 int(entry["width"]),
                 int(entry["height"]),
             )
             for entry in meta["clips"]
         ]
-    except (KeyError, TypeError, ValueError) as error:
+        extra = dict(meta.get("extra") or {})
+    except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
         raise InputError(f"{meta_path}: a field is missing or malformed ({error})") from error
     if not entries:
         raise InputError(f"{meta_path}: the collection has no clips")
@@ -70,7 +72,6 @@ def read_collection(path: Path | str) -> Collection:
     if offset is not None:
         head = head.with_offset(offset)
     clips = [_read_clip(path, head, *entry) for entry in entries]
-    extra = dict(meta.get("extra") or {})
     if (path / head_name).exists():  # a head file, which other folders call otherwise
         head_name = str((path / head_name).resolve())
     return Collection(path, head_name, head, betas, clips, extra, offset)
@@ -78,14 +79,18 @@ def read_collection(path: Path | str) -> Collection:
 
 def _read_offset(root: Path, head: HeadModel) -> np.ndarray:
     path = root / OFFSET_FILE
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            offset = np.asarray(stored["offset"], np.float32)
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path}: missing or damaged ({error})") from error
-    if offset.shape != head.template.shape or not np.isfinite(offset).all():
+    offset = read_arrays(path, ["offset"]).get("offset")
+    if offset is None or offset.shape != head.template.shape or not _finite(offset).all():
         raise InputError(f"{path}: 'offset' must hold {head.template.shape} finite numbers")
-    return offset
+    return np.asarray(offset, np.float32)
+
+
+def _finite(array: np.ndarray) -> np.ndarray:
+    """Where an array's values are numbers that stay finite as float32."""
+    if array.dtype.kind not in "iuf":
+        return np.zeros(array.shape, bool)
+    with np.errstate(over="ignore"):
+        return np.isfinite(array.astype(np.float32))
 
 
 def _read_clip(
@@ -94,14 +99,14 @@ def _read_clip(
     path = root / "clips" / name / "frames.npz"
     if not (0 < width <= _LARGEST_SIDE and 0 < height <= _LARGEST_SIDE):
         raise InputError(f"{root}: clip {name}: a picture size of {width}x{height}")
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            arrays = {key: stored[key] for key in stored.files}
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file; the collection is incomplete") from error
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path}: damaged ({error})") from error
-    count = len(arrays.get("frame_id", ()))
+    if not path.resolve().is_relative_to(root.resolve()):
+        raise InputError(f"{path}: a link that leads out of the collection; nothing there is read")
+    if not path.exists():
+        raise InputError(f"{path}: no such file; the collection is incomplete")
+    arrays = read_arrays(path, _ARRAYS)
+    count = np.size(arrays.get("frame_id", ()))
+    if count == 0:
+        raise InputError(f"{path}: the clip has no frames (no 'frame_id')")
     joints, vertices = len(head.joint_names), len(head.template)
     shapes = {
         "expression": (count, len(head.expression_basis)),
@@ -121,21 +126,22 @@ def _read_clip(
             raise InputError(f"{path}: the array {key!r} is missing")
         if arrays[key].shape != shape:
             raise InputError(f"{path}: {key!r} has shape {arrays[key].shape}, expected {shape}")
-        if arrays[key].dtype.kind == "f":
-            bad = ~np.isfinite(arrays[key].reshape(count, -1)).all(axis=1)
+        kinds = {"frame_id": "iu", "split": "U"}.get(key, "iuf")
+        if arrays[key].dtype.kind not in kinds:
+            raise InputError(f"{path}: {key!r} holds {arrays[key].dtype}, which it cannot")
+        if kinds == "iuf":
+            bad = ~_finite(arrays[key]).reshape(count, -1).all(axis=1)
             if bad.any():
                 frame = arrays["frame_id"][np.flatnonzero(bad)[0]]
                 raise InputError(f"{path}: {key!r} is not finite at frame {frame}")
-    if count == 0:
-        raise InputError(f"{path}: the clip has no frames")
+            arrays[key] = np.ascontiguousarray(arrays[key], np.float32)
+    if (arrays["frame_id"] > np.iinfo(np.int32).max).any():
+        raise InputError(f"{path}: 'frame_id' has numbers beyond 2147483647")
     if len(np.unique(arrays["frame_id"])) < count or (arrays["frame_id"] < 0).any():
         raise InputError(f"{path}: 'frame_id' must hold different numbers from 0 up")
     unknown = sorted(set(np.unique(arrays["split"]).tolist()) - set(SPLITS))
     if unknown:
         raise InputError(f"{path}: unknown split {unknown}; use {', '.join(SPLITS)}")
-    floats = [key for key in shapes if arrays[key].dtype.kind in "fiu" and key != "frame_id"]
-    for key in floats:
-        arrays[key] = np.ascontiguousarray(arrays[key], np.float32)
     return Clip(
         name=name,
         appearance=appearance,

@@ -13,7 +13,7 @@ from types import TracebackType
 import numpy as np
 
 from ..errors import InputError
-from ..files import replacing, write_text
+from ..files import check_folder_name, replacing, write_text
 from ..head.builtin import BUILTIN
 from ..images import write_gray, write_rgba
 from .model import FORMAT, SPLITS, VERSION, Clip
@@ -127,6 +127,7 @@ class CollectionWriter:
     def clip(self, clip: Clip) -> None:
         """Writes frames.npz and registers the clip."""
         check_name(clip.name, "clip name")
+        check_folder_name(clip.appearance, "appearance")
         unknown = set(np.unique(clip.split)) - set(SPLITS)
         if unknown:
             raise InputError(f"clip {clip.name}: unknown split {sorted(unknown)}; use {SPLITS}")

@@ -15,16 +15,29 @@ import torch
 
 from ..config import Config
 from ..errors import InputError
-from ..files import replacing
+from ..files import check_folder_name, replacing
 from ..head import HeadModel, load_head
+from ..reading import first_line
 from .field import Field
 from .identities import check_shapes, identity, read_identities
 from .limits import overflowing
 
 FORMAT = "pav-avatar"
 VERSION = 2
-_LARGEST_HEADER = 100 << 20
+_LARGEST_HEADER = 16 << 20
 _LARGEST_HALF = float(torch.finfo(torch.float16).max)
+# kinds of values and sizes of what lies beside the weights; None: any, V: the canonical vertices
+_ARRAYS: dict[str, tuple[torch.dtype, tuple[int | str | None, ...]]] = {
+    "mesh.canonical_vertices": (torch.float32, ("V", 3)),
+    "mesh.triangles": (torch.int32, (None, 3)),
+    "mesh.uvs": (torch.float32, (None, 2)),
+    "mesh.uv_triangles": (torch.int32, (None, 3)),
+    "mesh.rigid_weights": (torch.float32, ("V",)),
+    "space.box_min": (torch.float32, (3,)),
+    "space.occupied": (torch.uint8, (None, None)),
+}
+_HEAD = ("head.betas", "head.offset")  # of one person or of several: see `check_shapes`
+_LARGEST_BOX = 1e3  # metres
 
 
 @dataclass(eq=False)
@@ -160,13 +173,21 @@ class Avatar:
         path = Path(path)
         header = read_header(path)
         try:
-            with safetensors.safe_open(path, framework="pt") as stored:
-                tensors = {key: stored.get_tensor(key) for key in stored.keys()}  # noqa: SIM118
-            return _assemble(header, tensors)
+            return _assemble(header, read_tensors(path))
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
-        except (safetensors.SafetensorError, KeyError, TypeError, ValueError, OSError) as error:
-            raise InputError(f"{path}: a damaged avatar file ({error})") from error
+        except (KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
+            raise InputError(f"{path}: a damaged avatar file ({first_line(error)})") from error
+
+
+def read_tensors(path: Path) -> dict[str, torch.Tensor]:
+    """What a safetensors file holds, in memory of its own: another program that writes into the
+    file must not change, or with its end take away, what was read. InputError for a damaged one."""
+    try:
+        with safetensors.safe_open(path, framework="pt") as stored:
+            return {key: stored.get_tensor(key).clone() for key in stored.keys()}  # noqa: SIM118
+    except (safetensors.SafetensorError, ValueError, RuntimeError, TypeError, OSError) as error:
+        raise InputError(f"damaged ({first_line(error)})") from error
 
 
 def _halved(values: torch.Tensor) -> torch.Tensor:
@@ -186,28 +207,78 @@ def read_header(path: Path | str) -> dict[str, Any]:
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such avatar file")
-    wrong = InputError(f"{path}: not an avatar file (.pav)")
-    with open(path, "rb") as stream:
-        start = stream.read(8)
-        size = struct.unpack("<Q", start)[0] if len(start) == 8 else 0
-        if not 0 < size <= min(_LARGEST_HEADER, path.stat().st_size):
-            raise wrong
-        raw = stream.read(size)
-    try:
-        header = json.loads(json.loads(raw)["__metadata__"]["pav"])
-    except (ValueError, KeyError, TypeError) as error:
-        raise wrong from error
-    if not isinstance(header, dict) or header.get("format") != FORMAT:
-        raise wrong
+    header = read_metadata(path)
+    if header.get("format") != FORMAT:
+        raise InputError(f"{path}: not an avatar file (.pav)")
     if header.get("version") != VERSION:
         raise InputError(
-            f"{path}: avatar version {header.get('version')!r}; this program reads {VERSION}"
+            f"{path}: avatar version {header.get('version')!r:.80}; this program reads {VERSION}"
         )
     try:
-        read_identities(header)
+        _check_header(header)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"{path}: a field of its header is missing or malformed") from error
     return header
+
+
+def read_metadata(path: Path) -> dict[str, Any]:
+    """The JSON object that our safetensors files carry; {} where there is none that is whole."""
+    try:
+        with open(path, "rb") as stream:
+            start = stream.read(8)
+            size = struct.unpack("<Q", start)[0] if len(start) == 8 else 0
+            if not 0 < size <= min(_LARGEST_HEADER, path.stat().st_size):
+                return {}
+            header = json.loads(json.loads(stream.read(size))["__metadata__"]["pav"])
+    except (ValueError, KeyError, TypeError, RecursionError):
+        return {}
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    return header if isinstance(header, dict) else {}
+
+
+def _check_header(header: dict[str, Any]) -> None:
+    """InputError, or what a wrong kind of value raises, for a header whose parts are not as
+    `Avatar.save` writes them."""
+    Config.from_json(header["config"])
+    names = header["appearances"]
+    if not isinstance(names, list) or not names or len(set(names)) < len(names):
+        raise InputError("the appearances' names are missing, or one is there twice")
+    for name in names:
+        for part in name.split("/") if isinstance(name, str) else [name]:  # person/look
+            check_folder_name(part, "appearance")
+    read_identities(header)
+    expressions, head = header["expression_names"], header["head"]
+    texts = [*expressions, head["name"], head["fingerprint"]]
+    if not isinstance(expressions, list) or not all(isinstance(text, str) for text in texts):
+        raise InputError("the names of the head or of its expressions are no texts")
+    if not 0 < float(header["box_size"]) < _LARGEST_BOX:
+        raise InputError(f"a space of {header['box_size']!r:.80} metres")
+    if not isinstance(header["record"], dict):
+        raise InputError("the record of its training is malformed")
+
+
+def _check_arrays(tensors: dict[str, torch.Tensor]) -> None:
+    """InputError for a tensor that is not finite, or beside the weights of a wrong kind or size."""
+    for name, tensor in tensors.items():
+        if tensor.is_floating_point() and not torch.isfinite(tensor).all():
+            raise InputError(f"the values of {name!r:.80} are not finite")
+    count = len(tensors["mesh.canonical_vertices"])
+    for name, (kind, sizes) in _ARRAYS.items():
+        found = tensors.get(name)
+        wanted = [count if size == "V" else size for size in sizes]
+        shape = None if found is None else tuple(found.shape)
+        fits = shape is not None and len(shape) == len(wanted)
+        if found is None or found.dtype != kind or not fits or any(
+            size not in (None, there) for size, there in zip(wanted, shape or (), strict=True)
+        ):  # fmt: skip
+            what = "missing" if found is None else f"{found.dtype} {shape}"
+            raise InputError(f"{name} is {what}; {kind} {wanted} expected")
+    for name in _HEAD:
+        if name in tensors and tensors[name].dtype != torch.float32:
+            raise InputError(f"{name} is {tensors[name].dtype}; float32 expected")
 
 
 def _check_weights(
@@ -227,7 +298,7 @@ def _check_weights(
     for name, tensor in expected.items():
         found = tensors.get(f"field.{name}")
         if found is None or found.shape != tensor.shape:
-            shape = None if found is None else tuple(found.shape)
+            shape = None if found is None else f"{found.dtype} {tuple(found.shape)}"
             raise InputError(
                 f"the weights {name!r} are {shape}, the settings ask for {tuple(tensor.shape)}"
             )
@@ -237,18 +308,14 @@ def _check_weights(
 
 def _assemble(header: dict[str, Any], tensors: dict[str, torch.Tensor]) -> Avatar:
     config = Config.from_json(header["config"])
-    appearances = [str(name) for name in header["appearances"]]
+    appearances = list(header["appearances"])
     identities = read_identities(header)
-    for name, tensor in tensors.items():
-        if tensor.is_floating_point() and not torch.isfinite(tensor).all():
-            raise InputError(f"the values of {name!r} are not finite")
+    _check_arrays(tensors)
     mesh = {k.split(".")[1]: v.numpy() for k, v in tensors.items() if k.startswith("mesh.")}
     vertices, triangles = mesh["canonical_vertices"], mesh["triangles"]
     _check_indices("triangles", triangles, len(vertices))
     _check_indices("uv_triangles", mesh["uv_triangles"], len(mesh["uvs"]))
     _check_weights(config, header, len(vertices), tensors)
-    if len(mesh["rigid_weights"]) != len(vertices):
-        raise InputError("rigid_weights and vertices differ in number")
     cells = config.occupancy_resolution
     packed = tensors["space.occupied"].numpy()
     if packed.shape != (len(appearances), -(-(cells**3) // 8)):
@@ -264,17 +331,17 @@ def _assemble(header: dict[str, Any], tensors: dict[str, torch.Tensor]) -> Avata
         triangles,
         mesh["uvs"],
         mesh["uv_triangles"],
-        tuple(str(name) for name in header["expression_names"]),
+        tuple(header["expression_names"]),
         rigid_weights=mesh["rigid_weights"],
         box_min=tensors["space.box_min"].numpy(),
-        box_size=_size(header["box_size"]),
+        box_size=float(header["box_size"]),
         occupied=bits.astype(bool).reshape(len(appearances), cells, cells, cells),
-        head_name=str(header["head"]["name"]),
-        head_fingerprint=str(header["head"]["fingerprint"]),
+        head_name=header["head"]["name"],
+        head_fingerprint=header["head"]["fingerprint"],
         betas=betas,
         head_offset=offset,
         identities=identities,
-        record=dict(header["record"]),
+        record=header["record"],
     )
     state = {k[6:]: v for k, v in tensors.items() if k.startswith("field.")}
     avatar.field.load_state_dict(state)
@@ -284,14 +351,6 @@ def _assemble(header: dict[str, Any], tensors: dict[str, torch.Tensor]) -> Avata
     return avatar
 
 
-def _size(value: Any) -> float:
-    if not 0 < float(value) < np.inf:
-        raise InputError(f"box_size {value}: metres, above 0 and finite")
-    return float(value)
-
-
 def _check_indices(name: str, array: np.ndarray, limit: int) -> None:
-    if array.ndim != 2 or array.shape[1] != 3 or array.dtype != np.int32:
-        raise InputError(f"{name} is {array.dtype} {array.shape}; expected int32 [T, 3]")
     if len(array) == 0 or array.min() < 0 or array.max() >= limit:
         raise InputError(f"{name} names vertices outside 0 to {limit - 1}")

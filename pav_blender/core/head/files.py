@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import uuid
-import zipfile
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
+from ..reading import read_arrays
 from .model import HeadModel
 
 FORMAT = "pav-head"
@@ -71,12 +71,7 @@ def read_head(path: str | Path) -> HeadModel:
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such head file")
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            content = {name: file[name] for name in file.files}
-    except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path}: not a readable head file ({error})") from error
-    return _assemble(path, content)
+    return _assemble(path, read_arrays(path))
 
 
 def _assemble(path: Path, content: dict[str, np.ndarray]) -> HeadModel:
@@ -95,8 +90,10 @@ def _assemble(path: Path, content: dict[str, np.ndarray]) -> HeadModel:
             raise InputError(f"{path}: {name} holds {content[name].dtype}, not numbers")
     for name in _QUANTISED:
         if name + "_step" in content:
-            step = np.float32(content[name + "_step"])
-            content[name] = content[name].astype(np.float32) * step
+            step = content[name + "_step"]
+            if step.shape != () or step.dtype.kind not in "iuf":
+                raise InputError(f"{path}: {name}_step is not one number")
+            content[name] = content[name].astype(np.float32) * np.float32(step)
     values: dict[str, Any] = {name: content[name] for name in _ARRAYS}
     values |= {name: str(content[name]) for name in _STRINGS}
     values |= {name: tuple(content[name].ravel().tolist()) for name in _NAMES}

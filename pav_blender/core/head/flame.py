@@ -7,7 +7,6 @@ model is read with it: texture coordinates, masks, landmarks, eyelids (`COMPANIO
 
 from __future__ import annotations
 
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..pickles import read_pickle
+from ..reading import member_names, read_arrays
 from .flame_parts import drawn_regions, masks_of, read_eyelids, read_landmarks, read_uvs
 from .model import HeadModel
 
@@ -142,11 +142,8 @@ def looks_like_flame(path: Path) -> bool:
     """Whether `path` may be FLAME's (a folder of it, a pickle, an npz with its arrays)."""
     if path.is_dir() or path.suffix == ".pkl":
         return True
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return "v_template.npy" in archive.namelist()
-    except (OSError, zipfile.BadZipFile):
-        return path.suffix != ".npz"
+    names = member_names(path)
+    return "v_template.npy" in names if names else path.suffix != ".npz"
 
 
 def _version_of(name: str) -> str:
@@ -180,21 +177,19 @@ def _content(path: Path) -> dict[str, Any]:
 
 
 def _npz(path: Path) -> dict[str, Any]:
+    names = member_names(path)
+    if names and not any(name.endswith(".npy") for name in names):
+        inside = next((n for n in names if n.endswith(".pkl")), "the .pkl file")
+        raise InputError(f"{path}: a zip archive; unpack it and name {inside} from it")
     try:
-        with zipfile.ZipFile(path) as archive:
-            names = archive.namelist()
-        if not any(name.endswith(".npy") for name in names):
-            inside = next((n for n in names if n.endswith(".pkl")), "the .pkl file")
-            raise InputError(f"{path}: a zip archive; unpack it and name {inside} from it")
-        with np.load(path, allow_pickle=False) as stored:
-            return {name: stored[name] for name in stored.files}
-    except (ValueError, EOFError, KeyError, OSError, zipfile.BadZipFile) as error:
-        if "allow_pickle" in str(error):
+        return dict(read_arrays(path))
+    except InputError as error:
+        if "pickled objects" in str(error):
             raise InputError(
                 f"{path}: it holds pickled objects; convert the model again with plain arrays "
                 "(J_regressor as J_regressor.toarray()), or name the .pkl"
             ) from error
-        raise InputError(f"{path}: a damaged archive ({error}); copy it again") from error
+        raise InputError(f"{error}; copy it again") from error
 
 
 def _arrays(path: Path, content: dict[str, Any]) -> dict[str, np.ndarray]:

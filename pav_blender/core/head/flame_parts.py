@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import zipfile
 from pathlib import Path
 
 import numpy as np
 
 from ..errors import InputError
 from ..pickles import read_pickle
+from ..reading import MIB, read_array, read_arrays, read_bytes
 from .model import HeadModel
 
 # FLAME_masks.pkl's names -> ours
@@ -26,6 +26,7 @@ _MASKS = {
     "forehead": ("forehead",),
     "boundary": ("boundary",),
 }
+_LARGEST_OBJ = 256 * MIB
 _PARTS_OF_FACE = ("face", "lips", "nose", "forehead", "left_eye_region", "right_eye_region")
 
 
@@ -57,7 +58,7 @@ def _read_obj(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Texture vertices [U,2] and faces [T,3,2] of (vertex, texture vertex), from 0."""
     texture, faces = [], []
     try:
-        for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        for line in read_bytes(path, _LARGEST_OBJ).decode("utf-8", "replace").splitlines():
             if line.startswith("vt "):
                 texture.append([float(x) for x in line.split()[1:3]])
             elif line.startswith("f "):
@@ -66,7 +67,7 @@ def _read_obj(path: Path) -> tuple[np.ndarray, np.ndarray]:
                     raise ValueError("faces must be triangles with texture coordinates")
                 faces.append(corners)
         result = np.array(texture, np.float64).reshape(-1, 2), np.array(faces).reshape(-1, 3, 2) - 1
-    except (OSError, ValueError) as error:
+    except (ValueError, OverflowError, TypeError) as error:
         raise InputError(f"{path}: not a readable OBJ with UVs ({error})") from error
     bad = not len(faces) or result[1].min() < 0 or result[1][..., 1].max() >= len(texture)
     if bad or not np.isfinite(result[0]).all():
@@ -165,10 +166,10 @@ def drawn_regions(
 
 def read_eyelids(path: Path, vertices: int) -> np.ndarray:
     """One eyelid's closing [V,3], metres, of metrical-tracker's `blendshapes` folder."""
-    try:
-        offsets = np.asarray(np.load(path, allow_pickle=False), np.float32)
-    except (OSError, ValueError, EOFError) as error:
-        raise InputError(f"{path}: not a readable array ({error})") from error
+    offsets = read_array(path)
+    if offsets.dtype.kind not in "iuf":
+        raise InputError(f"{path}: it holds {offsets.dtype}, not numbers")
+    offsets = np.asarray(offsets, np.float32)
     offsets = offsets.reshape(offsets.shape[-2:]) if offsets.ndim == 3 else offsets
     if offsets.shape != (vertices, 3) or not np.isfinite(offsets).all():
         raise InputError(f"{path}: {list(offsets.shape)}; an eyelid is [{vertices}, 3], finite")
@@ -181,12 +182,12 @@ def read_landmarks(path: Path, head: HeadModel) -> HeadModel:
     The others are carried over from the built-in head by a thin-plate spline through those 105
     and put on the nearest point of the surface.
     """
+    stored = read_arrays(path, ["lmk_face_idx", "lmk_b_coords", "landmark_indices"])
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            at = np.asarray(stored["lmk_face_idx"]).astype(np.int64).ravel()
-            weights = np.asarray(stored["lmk_b_coords"], np.float32).reshape(-1, 3)
-            numbers = np.asarray(stored["landmark_indices"]).astype(np.int64).ravel()
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        at = stored["lmk_face_idx"].astype(np.int64).ravel()
+        weights = stored["lmk_b_coords"].astype(np.float32).reshape(-1, 3)
+        numbers = stored["landmark_indices"].astype(np.int64).ravel()
+    except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{path}: not FLAME's MediaPipe embedding ({error})") from error
     count = len(head.triangles)
     right = len(at) == len(weights) == len(numbers) >= 10 and len(set(numbers)) == len(numbers)

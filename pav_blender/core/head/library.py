@@ -86,8 +86,8 @@ def remembered_head(version: str = "", fingerprint: str = "") -> HeadModel | Non
 
 
 def _read(path: Path, flame_version: str) -> tuple[HeadModel, dict[str, str]]:
-    if not path.exists():
-        raise InputError(f"{path}: no such head file")
+    if not (path.is_dir() or path.is_file()):  # what else there is may keep a reader waiting
+        raise InputError(f"{str(path)!r}: no such head file")
     path = path.absolute()
     if not looks_like_flame(path):
         return read_head(path), {"head": str(path)}

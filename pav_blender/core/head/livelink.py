@@ -16,12 +16,14 @@ from __future__ import annotations
 
 import csv
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from ..errors import InputError
+from ..reading import MIB, file_size, first_line
 
 _SIDED = [
     "browDown", "browOuterUp", "cheekSquint", "eyeBlink", "eyeLookDown", "eyeLookIn",
@@ -41,6 +43,7 @@ _TIMECODE = re.compile(r"(\d{1,2}):(\d{1,2}):(\d{1,2})[:;](\d{1,3}(?:\.\d+)?)")
 _RATES = (24, 25, 30, 48, 50, 60)
 _DAY = 24 * 3600.0
 _LONGEST = 1_000_000  # frames
+_LARGEST, _MOST_COLUMNS = 512 * MIB, 1000
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,22 +63,17 @@ def read_take(path: Path | str, timecode_rate: float = 0.0) -> Take:
     Raises InputError naming the file, the line and the fault.
     """
     path = Path(path)
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as stream:
-            lines = list(csv.reader(stream, strict=True))
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file") from error
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path}: not readable as a CSV file ({error})") from error
-    if not lines:
+    lines = _lines(path)
+    header = next(lines, None)
+    if header is None:
         raise InputError(f"{path}: the file is empty")
-    columns = _columns(path, lines[0])
+    columns = _columns(path, header)
     stamps, values = [], []
-    for number, cells in enumerate(lines[1:], start=2):
+    for number, cells in enumerate(lines, start=2):
         row = _row(f"{path}, line {number}", cells, columns)
         if row is not None:
             stamps.append((number, row[0], row[1]))
-            values.append(row[2])
+            values.append(np.array(row[2]))
     if not values:
         raise InputError(f"{path}: no frame in it holds a face")
     table = np.array(values).reshape(len(values), len(columns))
@@ -138,20 +136,32 @@ def _turns(angles: np.ndarray) -> np.ndarray:
     return Rotation.from_euler("YXZ", angles * (-1, 1, -1)).as_rotvec()
 
 
+def _lines(path: Path) -> Iterator[list[str]]:
+    """The cells of each line in turn; InputError where there is no such file, or no text in it."""
+    file_size(path, _LARGEST)
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as stream:
+            yield from csv.reader(stream, strict=True)
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: not readable as a CSV file ({error})") from error
+
+
 def _columns(path: Path, header: list[str]) -> list[str]:
     """Names of the columns after the first two: ARKit's spelling, and that of the angles."""
+    if len(header) > _MOST_COLUMNS:
+        raise InputError(f"{path}: {len(header)} columns, which no such recording has")
     names = [name.strip() for name in header]
     if [name.lower() for name in names[:2]] != ["timecode", "blendshapecount"]:
         raise InputError(
             f"{path}: not a recording of Live Link Face: its first line begins with "
-            f"{','.join(names[:2])!r}, not 'Timecode,BlendShapeCount'"
+            f"{','.join(names[:2])!r:.80}, not 'Timecode,BlendShapeCount'"
         )
     known = {name.lower(): name for name in ARKIT_NAMES}
     known |= {(part + a).lower(): part + a for part in _ROTATED for a in _ANGLES}
     columns = [known.get(name.lower(), name) for name in names[2:]]
     twice = next((name for name in columns if columns.count(name) > 1), None)
     if twice is not None:
-        raise InputError(f"{path}: the column {twice!r} is there twice")
+        raise InputError(f"{path}: the column {twice!r:.80} is there twice")
     lacking = [n for n in ARKIT_NAMES if n not in columns and n != _OPTIONAL]
     for part in _ROTATED:
         there = [part + angle in columns for angle in _ANGLES]
@@ -170,7 +180,7 @@ def _row(
         return None
     match = _TIMECODE.fullmatch(cells[0].strip())
     if match is None or int(match[2]) > 59 or int(match[3]) > 59:
-        raise InputError(f"{where}: {cells[0]!r} is no timecode HH:MM:SS:FF")
+        raise InputError(f"{where}: {cells[0]!r:.80} is no timecode HH:MM:SS:FF")
     if len(cells) > 1 and cells[1].strip() == "0":
         return None
     if len(cells) != len(columns) + 2:
@@ -178,7 +188,7 @@ def _row(
     try:
         values = [float(cell) for cell in cells[2:]]
     except ValueError as error:
-        raise InputError(f"{where}: {error}") from error
+        raise InputError(f"{where}: {first_line(error)}") from error
     bad = next((n for n, v in zip(columns, values, strict=True) if not np.isfinite(v)), None)
     if bad is not None:
         raise InputError(f"{where}: {bad} is not finite")

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import shutil
-import zipfile
 from collections.abc import Iterable
 from functools import lru_cache
 from pathlib import Path
@@ -17,6 +16,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..files import replacing, write_text
+from ..reading import read_arrays
 
 FORMAT = "pav-track-cache 1"
 _MARK = "pav-track-cache.txt"
@@ -43,11 +43,12 @@ class Cache:
         """The arrays stored under `key` and `name`, or None where they are not, or not whole."""
         if self._folder is None:
             return None
+        wanted = list(wanted)
         try:
-            with np.load(self._folder / key / f"{name}.npz", allow_pickle=False) as stored:
-                return {array: stored[array] for array in wanted}
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+            found = read_arrays(self._folder / key / f"{name}.npz", wanted)
+        except InputError:
             return None
+        return found if len(found) == len(wanted) else None
 
     def store(self, key: str, name: str, arrays: dict[str, np.ndarray]) -> None:
         """Raises InputError where the folder cannot be written."""

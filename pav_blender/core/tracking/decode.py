@@ -16,6 +16,7 @@ import numpy as np
 from ..errors import InputError
 from .cache import fingerprint
 
+_LARGEST = 1 << 30  # bytes of a picture
 _COVER_PICTURE = 0x400  # libavformat's AV_DISPOSITION_ATTACHED_PIC
 
 
@@ -175,6 +176,8 @@ def _pixel_aspect(stream: Any) -> float:
 def _upright(picture: Any, ratio: float) -> np.ndarray:
     """Square pixels, then turned as the file's display matrix says."""
     width = max(1, round(picture.width * ratio))
+    if 3 * width * picture.height > _LARGEST:
+        raise InputError(f"a video of {width}x{picture.height} pixels is not read")
     rgb = picture.to_ndarray(format="rgb24", width=width, height=picture.height)
     quarter_turns = round(getattr(picture, "rotation", 0) / 90) % 4
     return np.ascontiguousarray(np.rot90(rgb, quarter_turns))

@@ -13,8 +13,10 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from ..errors import InputError
+from ..reading import MIB, read_bytes, stored_members
 
 INSTALL = "`pip install mediapipe==0.10.21` (Python 3.9 to 3.12)"
+_LARGEST_TASK = 256 * MIB
 FACES, HANDS, HAND_POINTS = 4, 2, 21  # so many at most
 
 
@@ -161,8 +163,7 @@ class _TaskDetector:
     """The Tasks API with a face landmarker file: landmarks and 52 blend shape scores."""
 
     def __init__(self, mediapipe: Any, path: Path) -> None:
-        if not path.is_file():
-            raise InputError(f"{path}: no such landmark model file")
+        content = read_task(path)
         vision = importlib.import_module("mediapipe.tasks.python.vision")
         base = importlib.import_module("mediapipe.tasks.python").BaseOptions
         self._image, self._format = mediapipe.Image, mediapipe.ImageFormat.SRGB
@@ -172,7 +173,7 @@ class _TaskDetector:
                 # every frame on its own: the video mode's smoothing lags behind lips and lids
                 self._landmarker = vision.FaceLandmarker.create_from_options(
                     vision.FaceLandmarkerOptions(
-                        base_options=base(model_asset_buffer=path.read_bytes()),
+                        base_options=base(model_asset_buffer=content),
                         running_mode=vision.RunningMode.IMAGE,
                         num_faces=FACES,
                         output_face_blendshapes=True,
@@ -196,6 +197,17 @@ class _TaskDetector:
     def close(self) -> None:
         with quiet():
             self._landmarker.close()
+
+
+def read_task(path: Path) -> bytes:
+    """A `.task` file: an archive of models, stored as they are. MediaPipe's own code, which is
+    not Python, is given nothing else. InputError for any other file."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such landmark model file")
+    content = read_bytes(path, _LARGEST_TASK)
+    if not stored_members(path):
+        raise InputError(f"{path}: not a face landmarker model (an archive of models as they are)")
+    return content
 
 
 def _line(error: Exception) -> str:

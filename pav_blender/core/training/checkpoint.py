@@ -6,11 +6,12 @@ import dataclasses
 import json
 from pathlib import Path
 
-import safetensors
 import safetensors.torch
 import torch
 
+from ..config import Config
 from ..errors import InputError, PavError
+from ..field.avatar import read_metadata, read_tensors
 from ..files import replacing
 from .trainer import Status, Trainer
 
@@ -81,22 +82,23 @@ def load_checkpoint(path: Path, trainer: Trainer, source: str) -> None:
 
     Raises InputError where the file is damaged or was made from something else.
     """
-    try:
-        with safetensors.safe_open(path, framework="pt") as stored:
-            header = json.loads(stored.metadata()["pav"])
-            tensors = {key: stored.get_tensor(key) for key in stored.keys()}  # noqa: SIM118
-    except (safetensors.SafetensorError, KeyError, TypeError, ValueError, OSError) as error:
-        raise InputError(f"{path}: a damaged checkpoint; remove it to begin anew") from error
-    if header.get("format") != FORMAT or header["config"] != trainer.config.to_json():
+    header = read_metadata(path)
+    if header.get("format") != FORMAT:
+        raise InputError(f"{path}: a damaged checkpoint; remove it to begin anew")
+    if header.get("config") != trainer.config.to_json():
         raise InputError(f"{path}: made with other settings; remove it to begin anew")
-    if header["source"] != source:
+    if header.get("source") != source:
         raise InputError(f"{path}: made from another collection; remove it to begin anew")
     try:
+        tensors = read_tensors(path)
+        for name, tensor in tensors.items():
+            if tensor.is_floating_point() and torch.isnan(tensor).any():
+                raise ValueError(name)
         state = {k[6:]: v for k, v in tensors.items() if k.startswith("field.")}
         trainer.avatar.field.load_state_dict(state)
         for name, (m, v) in trainer.moments.items():
-            m.copy_(tensors[f"m.{name}"])
-            v.copy_(tensors[f"v.{name}"])
+            put(m, tensors[f"m.{name}"])
+            put(v, tensors[f"v.{name}"])
         trainer.visibility.restore(
             {name[5:]: value for name, value in tensors.items() if name.startswith("seen.")}
         )
@@ -108,8 +110,32 @@ def load_checkpoint(path: Path, trainer: Trainer, source: str) -> None:
         trainer.pools = {int(group): list(pool) for group, pool in header["pools"]}
         trainer.status = Status(**header["status"])
         trainer.watch.restore(header.get("watch", {}))
+        _check_status(trainer.status, trainer.config)
         if trainer.refiner is not None:
             named = {k[10:]: v for k, v in tensors.items() if k.startswith("corrected.")}
             trainer.refiner.restore(named, header["refinement"])
-    except (KeyError, RuntimeError, ValueError, TypeError) as error:
+        trainer.check_restored()
+    except (
+        KeyError, IndexError, RuntimeError, ValueError, TypeError, AttributeError, OverflowError,
+        InputError,
+    ) as error:  # fmt: skip
         raise InputError(f"{path}: does not fit this training; remove it to begin anew") from error
+
+
+def put(target: torch.Tensor, stored: torch.Tensor) -> None:
+    """Copies into `target`; ValueError for another size, which copying alone would spread."""
+    if target.shape != stored.shape:
+        raise ValueError(f"{tuple(stored.shape)} in place of {tuple(target.shape)}")
+    target.copy_(stored)
+
+
+def _check_status(status: Status, config: Config) -> None:
+    """ValueError, or TypeError, where training cannot have stood there."""
+    counts = (status.iteration, range(1 << 62)), (status.rays, range(1, config.rays + 1))
+    if any(type(number) is not int or number not in known for number, known in counts):
+        raise ValueError("counts")
+    amounts = status.seconds, status.samples_per_ray, status.filled
+    if not (0 < status.step < 1 and all(0 <= amount < 1e9 for amount in amounts)):
+        raise ValueError("amounts")
+    if not isinstance(status.loss, float) or not isinstance(status.psnr, float):
+        raise ValueError("loss")  # any number: of a batch that failed it is none

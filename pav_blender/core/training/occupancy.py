@@ -92,6 +92,8 @@ class Visibility:
     def restore(self, state: dict[str, torch.Tensor]) -> None:
         """Takes up the state of an interrupted training, in place."""
         for name, tensor in self.state().items():
+            if tensor.shape != state[name].shape:
+                raise ValueError(f"{name} of {tuple(state[name].shape)}")
             tensor.copy_(state[name])
         self._refresh()
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
+
+from ..errors import InputError
+from ..reading import read_json
 
 PICTURE, CURVE = "preview.png", "curve.json"
 COLUMNS = ("iteration", "seconds", "loss", "psnr")  # of the curve's rows
@@ -18,8 +20,8 @@ def checkpoint_path(avatar_path: Path) -> Path:
 def read_curve(folder: Path | str) -> list[tuple[float, ...]]:
     """Rows of COLUMNS of a training so far; empty where there is no curve, or none that fits."""
     try:
-        content = json.loads((Path(folder) / CURVE).read_text(encoding="utf-8"))
+        content = read_json(Path(folder) / CURVE)
         rows = [tuple(float(value) for value in row) for row in content["rows"]]
-    except (OSError, ValueError, KeyError, TypeError):
+    except (InputError, ValueError, KeyError, TypeError, OverflowError):
         return []
     return [row for row in rows if len(row) == len(COLUMNS) and all(map(math.isfinite, row))]

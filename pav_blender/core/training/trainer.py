@@ -184,6 +184,19 @@ class Trainer:
         self.generator.manual_seed(self.config.seed + which)
         self.watch.begin_anew()
 
+    def check_restored(self) -> None:
+        """ValueError where what a checkpoint said of frames is not of these."""
+        for groups in self._pyramid:
+            for frame in (frame for group in groups for frame in group):
+                errors = self.attention.of(frame)
+                if errors.dtype != np.float32 or errors.shape != (len(frame.tiles),):
+                    raise ValueError(f"errors of {frame.name}")
+        for group, pool in self.pools.items():
+            fits = 0 <= group < len(self._pyramid[0])
+            known = range(len(self._pyramid[0][group])) if fits else range(0)
+            if not all(type(number) is int and number in known for number in pool):
+                raise ValueError(f"frames in use of group {group}")
+
     def learn_from(self, frames: list[Frame]) -> None:
         """Takes in more frames of appearances that are there, once pictures are whole."""
         for group in self._pyramid[0]:

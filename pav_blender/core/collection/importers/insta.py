@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import InputError
+from ...reading import MIB, read_bytes
 from .labels import INSTA as LABEL_TABLE
 from .meshes import read_vertices
 from .parsed import VERTICES, ParsedClip, Picture, padded_pose, stacked
@@ -136,8 +137,8 @@ def _row(
 
 def _expression(path: Path, most: int) -> np.ndarray:
     try:
-        values = np.array(path.read_bytes().split(), np.float64)
-    except (OSError, ValueError) as error:
+        values = np.array(read_bytes(path, MIB).split(), np.float64)
+    except ValueError as error:
         raise InputError(f"{path}: not one coefficient a line ({error})") from error
     if not 0 < len(values) <= most:
         raise InputError(f"{path}: {len(values)} coefficients; the head has {most} at most")

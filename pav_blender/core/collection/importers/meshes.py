@@ -11,8 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import InputError
+from ...reading import MIB, read_bytes
 from .parsed import VERTICES
 
+_LARGEST = 1024 * MIB
 _KINDS = {"float": "f4", "float32": "f4", "double": "f8", "float64": "f8", "uchar": "u1",
           "uint8": "u1", "char": "i1", "int8": "i1", "short": "i2", "int16": "i2",
           "ushort": "u2", "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4",
@@ -23,10 +25,9 @@ def read_vertices(path: Path, count: int | None = VERTICES) -> np.ndarray:
     """[count, 3] float32, in the file's units (None: however many there are); InputError for
     another mesh or a damaged file."""
     try:
-        content = path.read_bytes()
+        content = read_bytes(path, _LARGEST)
         found = _ply(content) if path.suffix == ".ply" else _obj(content)
     except (
-        OSError,
         ValueError,
         DeprecationWarning,
         UnicodeDecodeError,

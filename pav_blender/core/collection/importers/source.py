@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import re
-import zipfile
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
@@ -12,10 +10,13 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ...errors import InputError
+from ...reading import MIB
+from ...reading import read_arrays as _read_arrays
+from ...reading import read_json as _read_json
 
 T = TypeVar("T")
 Tell = Callable[[float], None] | None  # of a reader: the part done, from 0 to 1
-_LARGEST_JSON = 512 << 20
+_LARGEST_JSON = 512 * MIB
 PICTURES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG")
 
 
@@ -63,31 +64,12 @@ class Source:
 
     def arrays(self, name: Any) -> dict[str, np.ndarray]:
         """A file of arrays (.npz); InputError where it is missing, damaged or holds objects."""
-        place = self.path(name)
-        try:
-            with np.load(place, allow_pickle=False) as stored:
-                return {key: stored[key] for key in stored.files}
-        except FileNotFoundError as error:
-            raise InputError(f"{place}: no such file") from error
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            raise InputError(f"{place}: damaged, or it holds pickled objects ({error})") from error
-        except AttributeError as error:  # a lone array where several are expected
-            raise InputError(f"{place}: not a file of several arrays") from error
+        return _read_arrays(self.path(name))
 
 
 def read_json(path: Path) -> dict[str, Any]:
     """A JSON object; InputError where it is anything else."""
-    try:
-        if path.stat().st_size > _LARGEST_JSON:
-            raise InputError(f"{path}: too large for a description of frames")
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file") from error
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not readable as JSON ({error})") from error
-    if not isinstance(content, dict):
-        raise InputError(f"{path}: not a JSON object")
-    return content
+    return _read_json(path, _LARGEST_JSON)
 
 
 def peek_json(path: Path) -> dict[str, Any]:
