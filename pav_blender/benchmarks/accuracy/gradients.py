@@ -45,7 +45,7 @@ def measure(avatar: Avatar, frame: Frame, rays: int = _RAYS) -> tuple[list[dict]
     with kernels.plain_torch():
         double = copy.deepcopy(avatar.field).double()
         exact = gradients(avatar, double, pixels, picked, torch.float64)
-    rows = []
+    rows: list[dict[str, Any]] = []
     for group, prefix in GROUPS.items():
         names = [n for n in exact if n == prefix or (prefix[-1] == "." and n.startswith(prefix))]
         if not names:

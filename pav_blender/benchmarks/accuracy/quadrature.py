@@ -129,7 +129,8 @@ def order(steps: list[float], error: list[float], floor: float = 0.0) -> float:
     kept = [(s, e) for s, e in zip(steps, error, strict=True) if e > floor]
     if len(kept) < 3:
         return float("nan")
-    return float(np.polyfit(*np.log(np.array(kept)).T, 1)[0])
+    logarithms = np.log(np.array(kept))
+    return float(np.polyfit(logarithms[:, 0], logarithms[:, 1], 1)[0])
 
 
 def measure() -> tuple[list[dict[str, Any]], list[Claim]]:

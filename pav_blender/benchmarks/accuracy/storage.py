@@ -59,7 +59,7 @@ def measure(
         "a texture an appearance": dataclasses.replace(avatar.config, appearance="surface"),
         "the paper's preset": Config.paper(),
     }
-    growth = []
+    growth: list[dict[str, Any]] = []
     for name, config in modes.items():
         for count in COUNTS:
             whole, half = (sum(sizes(avatar, config, count, h).values()) for h in (False, True))
@@ -68,14 +68,12 @@ def measure(
             )
     stored = _stored(avatar, collection)
     count = len(avatar.appearances)
-    whole, half = (sizes(avatar, avatar.config, count, h) for h in (False, True))
-    parts = [{"part": k, "MB": whole[k], "MB in halves": half[k]} for k in whole]
+    both = [sizes(avatar, avatar.config, count, half) for half in (False, True)]
+    parts = [{"part": k, "MB": both[0][k], "MB in halves": both[1][k]} for k in both[0]]
     five = {r["settings"]: r for r in growth if r["appearances"] == 5}
     largest = max(five["as it is"]["MB in halves"],
                   five["a texture an appearance"]["MB in halves"])  # fmt: skip
-    off = max(
-        abs(sum(s.values()) / r["MB"] - 1) for s, r in zip((whole, half), stored, strict=True)
-    )
+    off = max(abs(sum(part.values()) / r["MB"] - 1) for part, r in zip(both, stored, strict=True))
     return {"parts": parts, "growth": growth, "stored": stored}, [
         Claim.at_most("five appearances, whole", five["as it is"]["MB"], LARGEST, "MB"),
         Claim.at_most("five appearances, a texture each, in halves", largest, LARGEST, "MB"),
