@@ -68,7 +68,7 @@ def measure(avatar: Avatar, frame: Frame) -> tuple[list[dict[str, Any]], list[Cl
     for name, (kind, settings) in settings_of().items():
         shown(
             scene, rays.pick(torch.arange(16)), settings
-        )  # compiled, and what a pose knows, known
+        )  # compiled; what a pose knows, known
         started = time.perf_counter()
         ours = shown(scene, rays, settings)
         seconds = time.perf_counter() - started
