@@ -33,6 +33,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="another performance in the same appearances (`pav studio --performance 1`); "
         "filmed into OUT/studio5_novel beside the studio's own clips",
     )
+    parser.add_argument(
+        "--identities",
+        type=Path,
+        metavar="COLLECTION",
+        help="`comparison`: another person's clips, for a row of both in one network",
+    )
     parser.add_argument("--iterations", type=int, default=3000, help="of each network (3000)")
     parser.add_argument("--seeds", type=int, default=3, help="trainings of each method (3)")
     parser.add_argument("--per-appearance", type=int, help="at most so many pictures of each set")
@@ -52,6 +58,8 @@ def run(args: argparse.Namespace) -> int:
         raise InputError("--iterations and --seeds take 1 or more")
     wanted = TABLES[args.name]
     keys = wanted.needs
+    if args.identities is not None and args.name == "comparison":
+        keys = (*keys, "ours_two")
     if args.only:
         keys = tuple(method(key).key for key in args.only.split(","))
     study, stop = _study(args), StopSignal()
@@ -90,6 +98,7 @@ def _study(args: argparse.Namespace) -> Any:
         args.out / str(args.iterations),
         args.iterations,
         None if novel is None else read_collection(novel),
+        None if args.identities is None else read_collection(args.identities),
         args.per_appearance,
         args.weights,
     )

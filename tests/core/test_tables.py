@@ -7,8 +7,10 @@ import shutil
 
 import numpy as np
 import pytest
+from toy import make_toy
 
 from pav_blender.cli import main
+from pav_blender.core.collection import read_collection
 from pav_blender.core.config import Config
 from pav_blender.core.errors import Cancelled, InputError
 from pav_blender.core.evaluation.methods import METHODS, method
@@ -94,7 +96,8 @@ def test_one_network_is_compared_with_one_a_clip():
 
 
 def test_a_method_of_each_row_and_no_other():
-    assert {key for table in TABLES.values() for key in table.needs} == {m.key for m in METHODS}
+    needed = {key for table in TABLES.values() for key in table.needs}
+    assert needed | {"ours_two"} == {m.key for m in METHODS}
     with pytest.raises(InputError, match="method 'x': one of insta"):
         method("x")
 
@@ -170,6 +173,16 @@ def test_a_study_that_was_stopped_goes_on(toy, quick, tmp_path):
     trained = (tmp_path / "ours-0.pav").stat().st_mtime_ns
     assert result(study, quick["ours"], 0).measures["test"]
     assert (tmp_path / "ours-0.pav").stat().st_mtime_ns == trained
+
+
+def test_two_people_have_a_row_of_the_comparison(toy, quick, tmp_path):
+    other = read_collection(make_toy(tmp_path / "other", frames=4, size=32, betas=(2, 2, 2, 2)))
+    study = Study(toy, tmp_path, iterations=2, per_appearance=1)
+    with pytest.raises(InputError, match="'ours_two' needs another person's clips"):
+        result(study, quick["ours_two"], 0)
+    found = result(dataclasses.replace(study, other=other), quick["ours_two"], 0)
+    assert set(found.examples) == set(toy.appearances)
+    assert math.isfinite(found.measures["test"]["psnr"])
 
 
 def test_the_verb_writes_every_form_of_a_table(toy, quick, tmp_path, capsys):

@@ -66,9 +66,7 @@ def measure(avatar: Avatar, frame: Frame) -> tuple[list[dict[str, Any]], list[Cl
     truth = Exact.of(avatar, frame).shown(rays, TRUTH * 1e-3)
     rows = [_row("truth", "float64", TRUTH, truth, truth, time.perf_counter() - started)]
     for name, (kind, settings) in settings_of().items():
-        shown(
-            scene, rays.pick(torch.arange(16)), settings
-        )  # compiled; what a pose knows, known
+        shown(scene, rays.pick(torch.arange(16)), settings)  # compiled; what a pose knows, known
         started = time.perf_counter()
         ours = shown(scene, rays, settings)
         seconds = time.perf_counter() - started

@@ -14,12 +14,13 @@ _PAPER = Config.paper()
 @dataclass(frozen=True)
 class Method:
     """key names its files; title is what tables call it; per_clip: a network for each appearance
-    instead of one for all."""
+    instead of one for all; two_people: one network for another person's clips too."""
 
     key: str
     title: str
     config: Config
     per_clip: bool = False
+    two_people: bool = False
 
 
 _INSTA = dataclasses.replace(_PAPER, appearance="none")
@@ -38,6 +39,7 @@ METHODS = (
     # features at the vertices of the nearest triangle, as the paper reads them
     Method("full", "PAV, full", _PAPER),
     Method("ours", "ours", Config()),
+    Method("ours_two", "ours, two people in one", Config(), two_people=True),
 )
 
 

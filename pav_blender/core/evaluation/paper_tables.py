@@ -31,7 +31,7 @@ _SETS = {
     "novel": "another performance",
 }
 _ABLATION = ("insta", "no_lnf", "no_offset", "surface", "full", "ours")
-_UNIFIED = ("insta", "full", "ours")
+_UNIFIED = ("insta", "full", "ours", "ours_two")
 _SEPARATE = ("insta_clips", "full", "ours")
 
 

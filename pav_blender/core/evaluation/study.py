@@ -14,6 +14,7 @@ from ..field.avatar import Avatar, read_header
 from ..files import write_text
 from ..images import write_rgba
 from ..progress import Report
+from ..training.people import People, read_people
 from ..training.places import checkpoint_path
 from ..training.train import fingerprint, train
 from .evaluate import Evaluation, evaluate, merged, summary
@@ -27,12 +28,14 @@ SETS = ("test", "view", "novel")
 @dataclass(frozen=True, eq=False)
 class Study:
     """What all methods of a table share. novel: another performance of the same person in the same
-    appearances, all of it unseen; weights: where perceptual metrics find theirs."""
+    appearances, all of it unseen; other: another person's clips, for methods that learn two;
+    weights: where perceptual metrics find theirs."""
 
     collection: Collection
     out: Path
     iterations: int
     novel: Collection | None = None
+    other: Collection | None = None
     per_appearance: int | None = None
     weights: Path | None = None
 
@@ -125,7 +128,12 @@ def _train(
 ) -> list[Path]:
     """The files of a method's networks."""
     config = replace(method.config, seed=seed, iterations=study.iterations)
-    parts: dict[str, Collection] = {f"{method.key}-{seed}": study.collection}
+    parts: dict[str, Collection | People] = {f"{method.key}-{seed}": study.collection}
+    if method.two_people:
+        if study.other is None:
+            raise InputError(f"method {method.key!r} needs another person's clips")
+        both = read_people({"person": study.collection, "other": study.other})
+        parts = {f"{method.key}-{seed}": both}
     if method.per_clip:
         parts = {
             f"{method.key}-{seed}-{name}": study.collection.only(name)
@@ -153,7 +161,7 @@ def _train(
     return paths
 
 
-def _is_trained(path: Path, part: Collection, config: dict[str, Any]) -> bool:
+def _is_trained(path: Path, part: Collection | People, config: dict[str, Any]) -> bool:
     if not path.is_file():
         return False
     header = read_header(path)
@@ -183,9 +191,11 @@ def _measure(study: Study, avatars: list[Avatar], name: str, progress: Report | 
 
 def _keep_examples(study: Study, method: Method, seed: int, scores: list[Score]) -> dict[str, str]:
     """Writes one picture an appearance; returns whose they are: frames by appearance."""
+    names = study.collection.appearances
     for score in scores:
-        write_rgba(example_path(study, method, seed, score.appearance), score.rendered)
-    return {score.appearance: score.frame.name for score in scores}
+        appearance = names[score.frame.appearance]
+        write_rgba(example_path(study, method, seed, appearance), score.rendered)
+    return {names[score.frame.appearance]: score.frame.name for score in scores}
 
 
 def _read(path: Path) -> dict[str, Any]:
