@@ -144,6 +144,13 @@ def evaluate(
     return result
 
 
+def absent(weights: Path | None = None) -> dict[str, str]:
+    """Metrics that cannot be measured here, by key, and why."""
+    nothing = Evaluation([], {}, [], metrics=KEYS)
+    _load(nothing, weights)
+    return nothing.absent
+
+
 def merged(parts: Sequence[Evaluation]) -> Evaluation:
     """Measures of several avatars, each of its own frames, as if one had made them all."""
     features = [part.features for part in parts if part.features is not None]

@@ -17,7 +17,7 @@ from ..progress import Report
 from ..training.people import People, read_people
 from ..training.places import checkpoint_path
 from ..training.train import fingerprint, train
-from .evaluate import Evaluation, evaluate, merged, summary
+from .evaluate import Evaluation, absent, evaluate, merged, summary
 from .heldout import Score
 from .methods import Method
 
@@ -88,10 +88,10 @@ def result(
         if measuring:
             measuring(done, **fields)
 
-    stored = _read(known)
+    stored, words = _read(known), absent(study.weights)
     if stored.get("source") != source:
         stored = {"source": source, "sets": {}}
-    missing = [name for name in study.sets if name not in stored["sets"]]
+    missing = [name for name in study.sets if not _is_measured(stored["sets"].get(name), words)]
     if missing:
         avatars = [Avatar.load(path) for path in paths]
         stored["parameters"] = sum(
@@ -109,7 +109,7 @@ def result(
         sum(record["seconds"] for record in trained),
         stored["parameters"],
         sum(path.stat().st_size for path in paths),
-        {name: stored["sets"][name]["summary"] for name in study.sets},
+        {name: stored["sets"][name]["summary"] | words for name in study.sets},
         stored["examples"],
     )
 
@@ -196,6 +196,13 @@ def _keep_examples(study: Study, method: Method, seed: int, scores: list[Score])
         appearance = names[score.frame.appearance]
         write_rgba(example_path(study, method, seed, appearance), score.rendered)
     return {names[score.frame.appearance]: score.frame.name for score in scores}
+
+
+def _is_measured(stored: dict[str, Any] | None, words: dict[str, str]) -> bool:
+    """Whether a set has a number for each metric but those that cannot be measured now."""
+    return stored is not None and not any(
+        isinstance(value, str) and key not in words for key, value in stored["summary"].items()
+    )
 
 
 def _read(path: Path) -> dict[str, Any]:
