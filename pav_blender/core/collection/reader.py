@@ -14,6 +14,7 @@ from .model import FORMAT, SPLITS, VERSION, Clip, Collection
 from .writer import OFFSET_FILE, check_name
 
 _LARGEST_SIDE = 16384
+_OPTIONAL = ("vertices", "landmarks")
 
 
 def read_collection(path: Path | str) -> Collection:
@@ -101,41 +102,7 @@ def _read_clip(
         raise InputError(f"{path}: no such file; the collection is incomplete") from error
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(f"{path}: damaged ({error})") from error
-    count = len(arrays.get("frame_id", ()))
-    joints, vertices = len(head.joint_names), len(head.template)
-    shapes = {
-        "expression": (count, len(head.expression_basis)),
-        "pose": (count, joints, 3),
-        "translation": (count, 3),
-        "intrinsics": (count, 3, 3),
-        "camera_to_world": (count, 4, 4),
-        "frame_id": (count,),
-        "split": (count,),
-    }
-    if "vertices" in arrays:
-        shapes["vertices"] = (count, vertices, 3)
-    if "landmarks" in arrays:
-        shapes["landmarks"] = (count, len(head.landmark_triangles), 2)
-    for key, shape in shapes.items():
-        if key not in arrays:
-            raise InputError(f"{path}: the array {key!r} is missing")
-        if arrays[key].shape != shape:
-            raise InputError(f"{path}: {key!r} has shape {arrays[key].shape}, expected {shape}")
-        if arrays[key].dtype.kind == "f":
-            bad = ~np.isfinite(arrays[key].reshape(count, -1)).all(axis=1)
-            if bad.any():
-                frame = arrays["frame_id"][np.flatnonzero(bad)[0]]
-                raise InputError(f"{path}: {key!r} is not finite at frame {frame}")
-    if count == 0:
-        raise InputError(f"{path}: the clip has no frames")
-    if len(np.unique(arrays["frame_id"])) < count or (arrays["frame_id"] < 0).any():
-        raise InputError(f"{path}: 'frame_id' must hold different numbers from 0 up")
-    unknown = sorted(set(np.unique(arrays["split"]).tolist()) - set(SPLITS))
-    if unknown:
-        raise InputError(f"{path}: unknown split {unknown}; use {', '.join(SPLITS)}")
-    floats = [key for key in shapes if arrays[key].dtype.kind in "fiu" and key != "frame_id"]
-    for key in floats:
-        arrays[key] = np.ascontiguousarray(arrays[key], np.float32)
+    _check_arrays(path, arrays, head)
     return Clip(
         name=name,
         appearance=appearance,
@@ -146,8 +113,53 @@ def _read_clip(
         translation=arrays["translation"],
         intrinsics=arrays["intrinsics"],
         camera_to_world=arrays["camera_to_world"],
-        frame_id=arrays["frame_id"].astype(np.int32),
+        frame_id=arrays["frame_id"],
         split=arrays["split"],
         vertices=arrays.get("vertices"),
         landmarks=arrays.get("landmarks"),
     )
+
+
+def _check_arrays(path: Path, arrays: dict[str, np.ndarray], head: HeadModel) -> None:
+    """InputError for the first array that is missing or wrong; numbers become float32 and int32."""
+    ids = arrays.get("frame_id")
+    if ids is None:
+        raise InputError(f"{path}: the array 'frame_id' is missing")
+    if ids.ndim != 1 or ids.dtype.kind not in "iu":
+        raise InputError(f"{path}: 'frame_id' is {ids.dtype} {ids.shape}, expected whole numbers")
+    count = len(ids)
+    if count == 0:
+        raise InputError(f"{path}: the clip has no frames")
+    if len(np.unique(ids)) < count or ids.min() < 0 or ids.max() > np.iinfo(np.int32).max:
+        raise InputError(f"{path}: 'frame_id' must hold different numbers from 0 up")
+    arrays["frame_id"] = ids.astype(np.int32)
+    shapes = {
+        "expression": (count, len(head.expression_basis)),
+        "pose": (count, len(head.joint_names), 3),
+        "translation": (count, 3),
+        "intrinsics": (count, 3, 3),
+        "camera_to_world": (count, 4, 4),
+        "split": (count,),
+        "vertices": (count, len(head.template), 3),
+        "landmarks": (count, len(head.landmark_triangles), 2),
+    }
+    for key, shape in shapes.items():
+        if key not in arrays:
+            if key in _OPTIONAL:
+                continue
+            raise InputError(f"{path}: the array {key!r} is missing")
+        if arrays[key].shape != shape:
+            raise InputError(f"{path}: {key!r} has shape {arrays[key].shape}, expected {shape}")
+        if key == "split":
+            continue
+        if arrays[key].dtype.kind not in "fiu":
+            raise InputError(f"{path}: {key!r} holds {arrays[key].dtype}, not numbers")
+        with np.errstate(over="ignore"):  # what is too large is infinite, and told
+            arrays[key] = np.ascontiguousarray(arrays[key], np.float32)
+        bad = ~np.isfinite(arrays[key].reshape(count, -1)).all(axis=1)
+        if bad.any():
+            frame = arrays["frame_id"][np.flatnonzero(bad)[0]]
+            raise InputError(f"{path}: {key!r} is not finite at frame {frame}")
+    unknown = sorted(set(np.unique(arrays["split"]).tolist()) - set(SPLITS))
+    if unknown:
+        raise InputError(f"{path}: unknown split {unknown}; use {', '.join(SPLITS)}")

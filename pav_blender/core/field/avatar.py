@@ -243,18 +243,20 @@ def _assemble(header: dict[str, Any], tensors: dict[str, torch.Tensor]) -> Avata
         if tensor.is_floating_point() and not torch.isfinite(tensor).all():
             raise InputError(f"the values of {name!r} are not finite")
     mesh = {k.split(".")[1]: v.numpy() for k, v in tensors.items() if k.startswith("mesh.")}
-    vertices, triangles = mesh["canonical_vertices"], mesh["triangles"]
+    triangles = mesh["triangles"]
+    vertices = _floats("canonical_vertices", mesh["canonical_vertices"], -1, 3)
     _check_indices("triangles", triangles, len(vertices))
     _check_indices("uv_triangles", mesh["uv_triangles"], len(mesh["uvs"]))
+    if len(mesh["uv_triangles"]) != len(triangles):
+        raise InputError("triangles and uv_triangles differ in number")
     _check_weights(config, header, len(vertices), tensors)
-    if len(mesh["rigid_weights"]) != len(vertices):
-        raise InputError("rigid_weights and vertices differ in number")
     cells = config.occupancy_resolution
     packed = tensors["space.occupied"].numpy()
     if packed.shape != (len(appearances), -(-(cells**3) // 8)):
         raise InputError(f"the occupancy has shape {packed.shape}; {cells} cells a side expected")
-    betas = tensors["head.betas"].numpy()
+    betas = _floats("betas", tensors["head.betas"].numpy())
     offset = tensors["head.offset"].numpy() if "head.offset" in tensors else None
+    offset = None if offset is None else _floats("the head's offset", offset)
     check_shapes(identities, betas, offset, len(vertices))
     bits = np.unpackbits(packed, axis=1, count=cells**3)
     avatar = Avatar.create(
@@ -262,11 +264,11 @@ def _assemble(header: dict[str, Any], tensors: dict[str, torch.Tensor]) -> Avata
         appearances,
         vertices,
         triangles,
-        mesh["uvs"],
+        _floats("uvs", mesh["uvs"], -1, 2),
         mesh["uv_triangles"],
         tuple(str(name) for name in header["expression_names"]),
-        rigid_weights=mesh["rigid_weights"],
-        box_min=tensors["space.box_min"].numpy(),
+        rigid_weights=_floats("rigid_weights", mesh["rigid_weights"], len(vertices)),
+        box_min=_floats("box_min", tensors["space.box_min"].numpy(), 3),
         box_size=_size(header["box_size"]),
         occupied=bits.astype(bool).reshape(len(appearances), cells, cells, cells),
         head_name=str(header["head"]["name"]),
@@ -288,6 +290,21 @@ def _size(value: Any) -> float:
     if not 0 < float(value) < np.inf:
         raise InputError(f"box_size {value}: metres, above 0 and finite")
     return float(value)
+
+
+def _floats(name: str, array: np.ndarray, *shape: int) -> np.ndarray:
+    """As float32. shape: what it must have, -1 for any number; none: anything."""
+    fits = len(array.shape) == len(shape) and all(
+        want in (-1, found) for want, found in zip(shape, array.shape, strict=True)
+    )
+    if array.dtype.kind != "f" or (shape and not fits):
+        expected = f" {shape}" if shape else ""
+        raise InputError(f"{name} is {array.dtype} {array.shape}; expected float32{expected}")
+    with np.errstate(over="ignore"):  # what is too large is infinite, and told
+        numbers = array.astype(np.float32)
+    if not np.isfinite(numbers).all():
+        raise InputError(f"{name} has values that are not finite")
+    return numbers
 
 
 def _check_indices(name: str, array: np.ndarray, limit: int) -> None:
