@@ -315,6 +315,8 @@ def _assemble(header: dict[str, Any], tensors: dict[str, torch.Tensor]) -> Avata
     vertices, triangles = mesh["canonical_vertices"], mesh["triangles"]
     _check_indices("triangles", triangles, len(vertices))
     _check_indices("uv_triangles", mesh["uv_triangles"], len(mesh["uvs"]))
+    if len(mesh["uv_triangles"]) != len(triangles):
+        raise InputError("triangles and uv_triangles differ in number")
     _check_weights(config, header, len(vertices), tensors)
     cells = config.occupancy_resolution
     packed = tensors["space.occupied"].numpy()

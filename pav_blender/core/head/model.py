@@ -217,7 +217,13 @@ _POSED = ("template", *_BASES, "joint_regressor", "skinning_weights")
 
 
 def _freeze(head: HeadModel, field: str, dtype: type) -> None:
-    array: np.ndarray = np.ascontiguousarray(getattr(head, field), dtype)
+    values = np.asarray(getattr(head, field))
+    if dtype is np.int32 and values.dtype.kind in "iu" and values.dtype != np.int32:
+        # an index too large for int32 must not come round as one that fits
+        limits = np.iinfo(np.int32)
+        values = np.clip(values.astype(np.int64), limits.min, limits.max)
+    with np.errstate(over="ignore"):  # what is too large is infinite, and told
+        array: np.ndarray = np.ascontiguousarray(values, dtype)
     if array.flags.writeable:
         array = array.copy() if array is getattr(head, field) else array
         array.flags.writeable = False
