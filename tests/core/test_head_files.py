@@ -90,6 +90,10 @@ def rewritten(path, **changes):
         ({"template": np.array(["x"])}, "not numbers"),
         ({"expression_names": np.array(["a"])}, "expression_basis"),
         ({"region/face": np.zeros(3, bool)}, "face"),
+        ({"region/face": np.full(12, "x")}, "face holds <U1, not yes or no"),
+        ({"joints_follow_expression": np.array("x")}, "not yes or no"),
+        ({"triangles": SMALL.triangles + 0.5}, "not whole numbers"),
+        ({"triangles": SMALL.triangles + 2**40}, "outside"),
     ],
 )
 def test_malformed_head_files_are_named(tmp_path, changes, word):

@@ -26,6 +26,7 @@ _QUANTISED = ("shape_basis", "expression_basis", "pose_basis")
 _FLAG = "joints_follow_expression"  # absent from older files, where it is false
 _OTHERS = (*_STRINGS, *_NAMES, _FLAG, "regions")
 _ARRAYS = tuple(field.name for field in fields(HeadModel) if field.name not in _OTHERS)
+_INDICES = ("triangles", "uv_triangles", "joint_parents", "landmark_triangles")
 _REGION = "region/"
 
 
@@ -85,15 +86,20 @@ def _assemble(path: Path, content: dict[str, np.ndarray]) -> HeadModel:
     missing = [n for n in (*_STRINGS, *_NAMES, *_ARRAYS) if n not in content]
     if missing:
         raise InputError(f"{path}: the head file lacks {', '.join(missing)}")
-    for name in _ARRAYS:
-        if content[name].dtype.kind not in "iuf":
-            raise InputError(f"{path}: {name} holds {content[name].dtype}, not numbers")
+    kinds = dict.fromkeys(_ARRAYS, ("iuf", "numbers"))
+    kinds |= dict.fromkeys(_INDICES, ("iu", "whole numbers"))
+    marks = [name for name in content if name == _FLAG or name.startswith(_REGION)]
+    kinds |= dict.fromkeys(marks, ("b", "yes or no"))
+    for name, (allowed, what) in kinds.items():
+        if content[name].dtype.kind not in allowed:
+            raise InputError(f"{path}: {name} holds {content[name].dtype}, not {what}")
     for name in _QUANTISED:
         if name + "_step" in content:
             step = content[name + "_step"]
             if step.shape != () or step.dtype.kind not in "iuf":
                 raise InputError(f"{path}: {name}_step is not one number")
-            content[name] = content[name].astype(np.float32) * np.float32(step)
+            with np.errstate(over="ignore"):  # what is too large is infinite, and told
+                content[name] = content[name].astype(np.float32) * np.float32(step)
     values: dict[str, Any] = {name: content[name] for name in _ARRAYS}
     values |= {name: str(content[name]) for name in _STRINGS}
     values |= {name: tuple(content[name].ravel().tolist()) for name in _NAMES}
