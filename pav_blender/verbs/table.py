@@ -132,7 +132,8 @@ def _write(args: argparse.Namespace, study: Any, results: dict[str, list[Any]]) 
     frames = sum(len(clip.indices("train")) for clip in study.collection.clips)
     caption = (
         f"{TABLES[args.name].caption}, {len(study.collection.appearances)} appearances, {frames} "
-        f"training frames, {args.iterations} iterations a network, {args.seeds} seeds"
+        f"training frames, {args.iterations} iterations a network, {args.seeds} "
+        f"{'seeds' if args.seeds > 1 else 'seed'}"
     )
     tables, claims = TABLES[args.name].build(results, caption)
     text = "\n".join(markdown(table) for table in tables)

@@ -168,7 +168,7 @@ head.data.shape_keys.key_blocks["jawOpen"].value = 1.0
 bpy.ops.pav.save_head(filepath="mine.npz")
 assert bpy.ops.pav.add_rig(filepath="mine.npz") == {"FINISHED"}
 assert bpy.context.object.name == "mine"
-for wrong, said in (("nowhere.npz", "no such head"), (sys.argv[2], "not a readable head")):
+for wrong, said in (("nowhere.npz", "no such head"), (sys.argv[2], "damaged, or not an .npz")):
     try:
         bpy.ops.pav.add_rig(filepath=wrong)
     except RuntimeError as error:

@@ -282,6 +282,7 @@ def test_betas_or_offsets_that_are_not_a_row_a_person_are_told(avatar, tmp_path,
         Avatar.load(tmp_path / "b.pav")
 
 
+@pytest.mark.slow
 def test_a_stopped_training_of_several_goes_on_and_not_with_others(people, small_config, tmp_path):
     config = dataclasses.replace(small_config, iterations=3, rays=256)
     whole = train(people, tmp_path / "whole.pav", config)

@@ -20,6 +20,7 @@ from pav_blender.core.collection.model import SPLITS
 from pav_blender.core.config import APPEARANCE_MODES, FRAME_MODES, Config
 from pav_blender.core.errors import InputError
 from pav_blender.core.field.avatar import Avatar, read_header
+from pav_blender.core.files import check_folder_name
 from pav_blender.core.head import read_head, write_head
 from pav_blender.core.head.livelink import ARKIT_NAMES, pose_of, read_take, resample
 from pav_blender.core.images import read_gray, read_rgba
@@ -30,11 +31,20 @@ seeds = st.integers(0, 2**32 - 1)
 names = st.from_regex(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}", fullmatch=True)
 # whatever a person may type: any script, blanks, quotes
 texts = st.text(st.characters(exclude_categories=("Cc", "Cs")), max_size=20)
+
+
 # the same, but pictures are written into a folder of that name
+def names_a_folder(name):
+    try:
+        return check_folder_name(name, "") == name
+    except InputError:
+        return False
+
+
 looks = (
     st.text(st.characters(categories=("L", "N"), include_characters=" _-.'()"), max_size=20)
     .map(lambda name: name.strip(" ."))
-    .filter(lambda name: name and name.isprintable() and name.upper() not in ("CON", "NUL"))
+    .filter(names_a_folder)
 )
 records = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | texts,
