@@ -255,7 +255,9 @@ def _check_header(header: dict[str, Any]) -> None:
     if not isinstance(expressions, list) or not all(isinstance(text, str) for text in texts):
         raise InputError("the names of the head or of its expressions are no texts")
     if not 0 < float(header["box_size"]) < _LARGEST_BOX:
-        raise InputError(f"a space of {header['box_size']!r:.80} metres")
+        raise InputError(
+            f"box_size {header['box_size']!r:.80}: metres, above 0 and below {_LARGEST_BOX:g}"
+        )
     if not isinstance(header["record"], dict):
         raise InputError("the record of its training is malformed")
 
