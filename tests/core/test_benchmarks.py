@@ -22,6 +22,7 @@ from pav_blender.core.rendering.render import RenderSettings
 from pav_blender.core.training.prepare import load_training_frames
 
 
+@pytest.mark.slow  # a minute; `pav bench accuracy` says the same of a trained avatar
 def test_the_reference_preset_is_what_plain_torch_gives(toy, toy_avatar):
     frame = a_frame(toy)
     inside = np.flatnonzero(frame.rgba[..., 3].reshape(-1) > 127)
