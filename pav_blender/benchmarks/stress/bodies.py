@@ -41,21 +41,19 @@ def needles(given: Given) -> Found:
 
 def duplicated(given: Given) -> Found:
     """Every triangle twice: the picture of the mesh as it was."""
-    head, found = given.ball, Found()
-    triangles = np.concatenate([head.avatar.triangles] * 2)
-    twice = ball_on(head.vertices, triangles)
-    agrees(found, twice)
-    found.at_most(
-        "from the mesh as it was", apart(shown(twice, WHOLE), shown(head, WHOLE)), 1.0, "/255"
-    )
-    return found
+    return _as_it_was(given, np.concatenate([given.ball.avatar.triangles] * 2))
 
 
 def flipped(given: Given) -> Found:
     """Every other triangle turned over: the picture of the mesh as it was."""
-    head, found = given.ball, Found()
-    triangles = head.avatar.triangles.copy()
+    triangles = given.ball.avatar.triangles.copy()
     triangles[::2] = triangles[::2, ::-1]
+    return _as_it_was(given, triangles)
+
+
+def _as_it_was(given: Given, triangles: np.ndarray) -> Found:
+    """The ball of other triangles, which make the same surface."""
+    head, found = given.ball, Found()
     other = ball_on(head.vertices, triangles)
     agrees(found, other)
     found.at_most(
