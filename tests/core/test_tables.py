@@ -161,7 +161,7 @@ def test_what_is_there_is_not_made_again(toy, quick, tmp_path):
     once_more = result(dataclasses.replace(study, iterations=4, novel=toy), quick["insta_clips"], 0)
     assert once_more.measures == novel.measures
     known.write_text("{")
-    with pytest.raises(InputError, match=r"insta_clips-0\.json: not what a study wrote"):
+    with pytest.raises(InputError, match=r"insta_clips-0\.json: not readable as JSON"):
         result(study, quick["insta_clips"], 0)
 
 

@@ -14,6 +14,7 @@ from ..field.avatar import Avatar, read_header
 from ..files import write_text
 from ..images import write_rgba
 from ..progress import Report
+from ..reading import read_json
 from ..training.people import People, read_people
 from ..training.places import checkpoint_path
 from ..training.train import fingerprint, train
@@ -88,7 +89,8 @@ def result(
         if measuring:
             measuring(done, **fields)
 
-    stored, words = _read(known), absent(study.weights)
+    stored: dict[str, Any] = read_json(known) if known.is_file() else {}
+    words = absent(study.weights)
     if stored.get("source") != source:
         stored = {"source": source, "sets": {}}
     missing = [name for name in study.sets if not _is_measured(stored["sets"].get(name), words)]
@@ -203,13 +205,3 @@ def _is_measured(stored: dict[str, Any] | None, words: dict[str, str]) -> bool:
     return stored is not None and not any(
         isinstance(value, str) and key not in words for key, value in stored["summary"].items()
     )
-
-
-def _read(path: Path) -> dict[str, Any]:
-    if not path.is_file():
-        return {}
-    try:
-        stored = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise InputError(f"{path}: not what a study wrote ({error}); remove it") from error
-    return stored if isinstance(stored, dict) else {}
