@@ -256,6 +256,7 @@ bpy.ops.pav.train()
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
+@pytest.mark.slow
 def test_goes_on_after_blender_was_killed_and_after_the_training_was(
     asked, tmp_path, request, monkeypatch
 ):

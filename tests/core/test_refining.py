@@ -233,6 +233,7 @@ def test_what_is_kept_is_what_helps():
     assert decided(25.0, 24.0, 24.5) == OFF
 
 
+@pytest.mark.slow
 def test_a_wrong_track_is_corrected_and_written(truth, off_track, small_config, tmp_path, capsys):
     out, refined_path = tmp_path / "a.pav", tmp_path / "refined"
     arguments = ["train", off_track.path, "--out", out, "--iterations", 200, "--refine-poses"]
