@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -14,6 +15,7 @@ from ..field.field import Samples
 from ..kernels.structures import Picks, Wave
 from .cameras import Camera
 
+_BLOCK = 64  # pixels a side of the squares that a picture is taken in, one after the other
 TILE = 4  # rays go together in squares of pixels: neighbours share triangles and cache lines
 
 
@@ -61,17 +63,24 @@ def camera_rays(
 
 
 def tiled(width: int, height: int) -> np.ndarray:
-    """Pixels [width * height] (row * width + column), tile after tile: neighbours search alike."""
-    bands, rest = divmod(height, TILE)
-    starts = np.arange(bands)[:, None] * (TILE * width)
-    last = _band(width, rest) + bands * TILE * width
-    return np.concatenate([(starts + _band(width, TILE)).reshape(-1), last])
+    """Pixels [width * height] (row * width + column), so that any run of neighbours in the order
+    covers a square as far as it can: what lies together is searched and read together."""
+    inner_row, inner_column = _curve(_BLOCK)
+    rows = np.arange(-(-height // _BLOCK))[:, None, None] * _BLOCK + inner_row
+    columns = np.arange(-(-width // _BLOCK))[None, :, None] * _BLOCK + inner_column
+    inside = (rows < height) & (columns < width)
+    return (rows * width + columns)[inside]
 
 
-def _band(width: int, height: int) -> np.ndarray:
-    """The same of one row of tiles, `height` pixels high."""
-    row, column = np.divmod(np.arange(width * height), width)
-    return np.argsort(column // TILE * TILE**2 + row * TILE + column % TILE)
+@lru_cache(maxsize=1)
+def _curve(side: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns of a square of pixels in the order of Morton's curve."""
+    at = np.arange(side * side)
+    row, column = np.zeros_like(at), np.zeros_like(at)
+    for bit in range(side.bit_length() - 1):
+        column |= (at >> 2 * bit & 1) << bit
+        row |= (at >> 2 * bit + 1 & 1) << bit
+    return row, column
 
 
 @dataclass(eq=False)

@@ -24,6 +24,7 @@ from ..kernels.cpu.threads import run_chunks, torch_alone
 from ..kernels.structures import Frozen, Picks, Probing, Traced, Wave
 from .cameras import Camera
 from .rays import RayBatch, camera_rays, pack, samples_of, tiled
+from .sparing import passes
 from .wearing import Appearance, Wearing, deformer_of, wearing_of
 
 _FAR_WAVE = 24  # samples a ray between two looks, where every look waits for a device
@@ -43,8 +44,9 @@ class RenderSettings:
     skip: pass over voxels known to be empty, look only at the middle of `probe` places that follow
     one another, or of `longest` that add no more than `share` to a pixel by what is known of the
     density there (`guide`), and at those beside it only where that adds more than `tolerance`;
-    negligible: weight a metre below which a sample's colour is not asked for; wave: samples a ray
-    between two looks at its transmittance; chunk: rays that a thread takes at a time.
+    negligible: weight a metre below which a sample's colour is not asked for; agreement: a pixel
+    between four that differ by less is their mean (`sparing`; 0: every pixel is traced); wave:
+    samples a ray between two looks at its transmittance; chunk: rays that a thread takes at a time.
     """
 
     step: float = 1e-3
@@ -55,13 +57,14 @@ class RenderSettings:
     probe: int = 3
     tolerance: float = 0.2
     negligible: float = 0.5
+    agreement: float = 0.05
     wave: int = 3
     chunk: int = 1 << 13
 
     def __post_init__(self) -> None:
         if not _FINEST <= self.step <= _COARSEST:
             raise InputError(f"step {self.step}: metres, from {_FINEST:g} to {_COARSEST:g}")
-        for name in ("transmittance", "share", "tolerance", "negligible"):
+        for name in ("transmittance", "share", "tolerance", "negligible", "agreement"):
             value = getattr(self, name)
             if not 0 <= value < np.inf:
                 raise InputError(f"{name} {value}: a finite number, 0 or more")
@@ -80,9 +83,17 @@ class RenderSettings:
                 share=0.05,
                 transmittance=2e-2,
                 negligible=1.0,
+                agreement=0.1,
             ),
             "final": cls(),
-            "reference": cls(step=3.9e-4, transmittance=0.0, skip=False, negligible=0.0, wave=64),
+            "reference": cls(
+                step=3.9e-4,
+                transmittance=0.0,
+                skip=False,
+                negligible=0.0,
+                agreement=0.0,
+                wave=64,
+            ),
         }
         if name not in presets:
             raise InputError(f"quality {name!r}: one of {', '.join(presets)}")
@@ -246,7 +257,7 @@ def render_scene(
         rgba = np.zeros((count, 4), np.float32)
         depth = np.full(count, np.inf, np.float32)
 
-        def trace(start: int, stop: int) -> None:
+        def trace(start: int, stop: int, order: np.ndarray) -> None:
             nonlocal done, evaluations
             # who asked for the picture may not be asked from another thread: Blender's is one
             ours = threading.get_ident() == caller
@@ -263,11 +274,14 @@ def render_scene(
             if ours and progress is not None:
                 progress(min(1.0, done / count))
 
-        run_chunks(trace, count, settings.chunk)
+        shape = (camera.height, camera.width)
+        picture = Picture(rgba.reshape(*shape, 4), depth.reshape(shape), 0)
+        for wanted in passes(picture.rgba, picture.depth, limit, settings.agreement):
+            pixels = order[wanted.reshape(-1)[order]]
+            run_chunks(trace, len(pixels), settings.chunk, pixels)
         if progress is not None:
             progress(1.0)
-    shape = (camera.height, camera.width)
-    return Picture(rgba.reshape(*shape, 4), depth.reshape(shape), evaluations)
+    return replace(picture, evaluations=evaluations)
 
 
 def trace_rays(

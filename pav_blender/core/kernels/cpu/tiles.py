@@ -77,6 +77,11 @@ class _Tile:
             one, undefined, ir.Constant(ir.VectorType(lane, LANES), None)
         )
 
+    def add_product(self, total: Any, left: Any, right: Any) -> Any:
+        # "contract" lets LLVM fuse the two where the processor can.
+        product = self.builder.fmul(left, right, flags=("contract",))
+        return self.builder.fadd(total, product, flags=("contract",))
+
     def accumulate(self, rows: int, vectors: int) -> list[Any]:
         """The loop along the depth; returns the sums row by row."""
         builder, depth = self.builder, self.given["depth"]
@@ -96,10 +101,7 @@ class _Tile:
         for row in range(rows):
             left = self.broadcast(builder.load(self.address("a", row, 0, along_a), align=4))
             for column in range(vectors):
-                # "contract" lets LLVM fuse the two where the processor can.
-                product = builder.fmul(left, right[column], flags=("contract",))
-                total = sums[row * vectors + column]
-                totals.append(builder.fadd(total, product, flags=("contract",)))
+                totals.append(self.add_product(sums[row * vectors + column], left, right[column]))
         following = builder.add(k, k.type(1))
         k.add_incoming(k.type(0), before)
         k.add_incoming(following, loop)
