@@ -45,8 +45,9 @@ class RenderSettings:
     one another, or of `longest` that add no more than `share` to a pixel by what is known of the
     density there (`guide`), and at those beside it only where that adds more than `tolerance`;
     negligible: weight a metre below which a sample's colour is not asked for; agreement: a pixel
-    between four that differ by less is their mean (`sparing`; 0: every pixel is traced); wave:
-    samples a ray between two looks at its transmittance; chunk: rays that a thread takes at a time.
+    between four that differ by less is their mean (`sparing`; 0: every pixel is traced); brief:
+    networks in bfloat16 where the processor multiplies it; wave: samples a ray between two looks at
+    its transmittance; chunk: rays that a thread takes at a time.
     """
 
     step: float = 1e-3
@@ -58,6 +59,7 @@ class RenderSettings:
     tolerance: float = 0.2
     negligible: float = 0.5
     agreement: float = 0.05
+    brief: bool = True
     wave: int = 3
     chunk: int = 1 << 13
 
@@ -92,6 +94,7 @@ class RenderSettings:
                 skip=False,
                 negligible=0.0,
                 agreement=0.0,
+                brief=False,
                 wave=64,
             ),
         }
@@ -140,8 +143,13 @@ class Scene:
 
     @cached_property
     def packed(self) -> tuple[Any, ...]:
-        """The same as compiled functions take it."""
+        """The same as compiled functions take it, in bfloat16 where the processor allows."""
         return kernels.select("cpu").tracing.arrays_of(self.frozen)
+
+    @cached_property
+    def packed_exactly(self) -> tuple[Any, ...]:
+        """The same in float32."""
+        return kernels.select("cpu").tracing.arrays_of(self.frozen, brief=False)
 
 
 def pose_scene(
@@ -251,7 +259,7 @@ def render_scene(
     limits = None if limit is None else np.asarray(limit, np.float32).reshape(-1)
     with torch.inference_mode(), torch_alone():
         if _compiled(scene, settings):
-            scene.known, scene.packed  # noqa: B018  once, not by every thread
+            scene.known, _field(scene, settings)  # noqa: B018  once, not by every thread
         order = tiled(camera.width, camera.height)
         count = len(order)
         rgba = np.zeros((count, 4), np.float32)
@@ -338,6 +346,10 @@ def _compiled(scene: Scene, settings: RenderSettings) -> bool:
     return settings.skip and scene.avatar.field.device.type == "cpu"
 
 
+def _field(scene: Scene, settings: RenderSettings) -> tuple[Any, ...]:
+    return scene.packed if settings.brief else scene.packed_exactly
+
+
 def _whole(scene: Scene, rays: RayBatch, settings: RenderSettings) -> Traced:
     """The rays in one compiled pass."""
     ops, stance = kernels.select("cpu"), scene.stance
@@ -351,7 +363,7 @@ def _whole(scene: Scene, rays: RayBatch, settings: RenderSettings) -> Traced:
         scene.mesh,
         scene.voxels,
         scene.known,
-        scene.packed,
+        _field(scene, settings),
         rays.origins,
         rays.directions,
         first,

@@ -110,6 +110,19 @@ _locate_dense = _locator(False)
 _locate_hashed = _locator(True)
 
 
+def _both(writer: Writer, entries: Any, indices: Any, weights: Any, at: Any) -> Any:
+    """The two features of a sample."""
+    sums = [ir.Constant(_PAIR, None)] * 2
+    for corner in range(8):
+        here = writer.builder.add(at, LONG(corner * STRIDE))
+        share = writer.splat(writer.load(weights, here, FLOAT), _PAIR)
+        pair = writer.load(entries, _entry(writer, indices, at, corner), _PAIR)
+        half = corner & 1
+        sums[half] = writer.total(sums[half], writer.product(share, pair))
+    _fetch(writer, entries, indices, at)
+    return writer.builder.fadd(*sums)
+
+
 @intrinsic
 def read_corners(typing, table, index, weight, i, out, first, second):
     """Write the two features of sample i to out, at `first` and at `second`."""
@@ -117,20 +130,25 @@ def read_corners(typing, table, index, weight, i, out, first, second):
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         writer = Writer(context, builder, signature, values)
         entries, indices, weights, at, target, *places = writer.values
-        sums = [ir.Constant(_PAIR, None)] * 2
-        for corner in range(8):
-            here = builder.add(at, LONG(corner * STRIDE))
-            share = writer.splat(writer.load(weights, here, FLOAT), _PAIR)
-            pair = writer.load(entries, _entry(writer, indices, at, corner), _PAIR)
-            half = corner & 1
-            sums[half] = writer.total(sums[half], writer.product(share, pair))
-        _fetch(writer, entries, indices, at)
-        both = builder.fadd(*sums)
+        both = _both(writer, entries, indices, weights, at)
         for feature, place in enumerate(places):
             writer.store(builder.extract_element(both, INT(feature)), target, place)
         return context.get_dummy_value()
 
     return types.void(table, index, weight, i, out, first, second), generate
+
+
+@intrinsic
+def read_corners_short(typing, table, index, weight, i, out, at):
+    """Write the two features of sample i to the int16 array out, in bfloat16, from `at` on."""
+
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        writer = Writer(context, builder, signature, values)
+        entries, indices, weights, sample, target, place = writer.values
+        writer.store_short(_both(writer, entries, indices, weights, sample), target, place)
+        return context.get_dummy_value()
+
+    return types.void(table, index, weight, i, out, at), generate
 
 
 @intrinsic

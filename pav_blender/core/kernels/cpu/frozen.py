@@ -29,23 +29,33 @@ def arrays_of(field: Frozen) -> tuple[Any, ...]:
     """What compiled functions are told of a field: encodings, density and offset, colour, latent,
     the numbers of an untrained density, and how appearances mix."""
     return (
-        _encodings(field),
+        encodings_of(field),
         (_packed(field.density), _packed(field.offset), field.offset is not None),
         _packed(field.colour),
-        _latent(field),
-        np.array([*field.untrained, field.limit], np.float32),
-        (
-            len(field.shares),
-            rows_of(field.shares.reshape(-1), np.float32),
-            field.shares.shape[1],
-            rows_of(field.filled.reshape(-1), np.bool_),
-            field.filled.shape[1],
-            np.array(field.mixing, np.float32),
-        ),
+        latent_of(field),
+        untrained_of(field),
+        mixing_of(field),
     )
 
 
-def _encodings(field: Frozen) -> tuple[Any, Any]:
+def untrained_of(field: Frozen) -> np.ndarray:
+    return np.array([*field.untrained, field.limit], np.float32)
+
+
+def mixing_of(field: Frozen) -> tuple[Any, ...]:
+    """How appearances mix: their number, shares and filled cells, each with the cells a side, and
+    the numbers of `field.mixture`."""
+    return (
+        len(field.shares),
+        rows_of(field.shares.reshape(-1), np.float32),
+        field.shares.shape[1],
+        rows_of(field.filled.reshape(-1), np.bool_),
+        field.filled.shape[1],
+        np.array(field.mixing, np.float32),
+    )
+
+
+def encodings_of(field: Frozen) -> tuple[Any, Any]:
     """Tables and levels of the canonical and of the resting place, which may have none."""
     found = [
         (rows_of(tables, np.float32).reshape(-1), level_array(layout))
@@ -60,7 +70,7 @@ def _packed(layers: Layers | None) -> tuple[np.ndarray, np.ndarray]:
     return pack(weights, biases)
 
 
-def _latent(field: Frozen) -> tuple[Any, ...]:
+def latent_of(field: Frozen) -> tuple[Any, ...]:
     """The latent features in a row, their number, texels a side (0: at vertices), corners' UVs."""
     width = field.latent.shape[-1]
     side = field.latent.shape[1] if len(field.corner_uvs) else 0
@@ -81,7 +91,19 @@ def features_for(field, most):
 
 
 @njit(**INLINE)
-def _untrained(distance, settings):
+def inputs_for(field, count):
+    """Where `densities` puts what offset and colour see of `count` samples, a row each."""
+    return np.zeros(count * columns_of(field), np.float32)
+
+
+@njit(**INLINE)
+def shading_room(field):
+    """What `shade` needs to work in."""
+    return np.zeros((BLOCK + ROOM) * columns_of(field), np.float32), workspace(field[2][0])
+
+
+@njit(**INLINE)
+def untrained(distance, settings):
     """`field.Field.untrained`."""
     near = distance / settings[2] - settings[3]
     near = np.float32(1) - min(max(near, np.float32(0)), np.float32(1))
@@ -111,7 +133,7 @@ def _encode(encoding, places, axes, start, count, features, row, scratch):
 
 
 @njit(**INLINE)
-def _embed(surface, first, mesh_corners, triangle, places, begin, count, index, weight, out, row,
+def embedding_rows(surface, first, mesh_corners, triangle, places, begin, count, index, weight, out, row,
            step):  # fmt: skip
     """An appearance's features, which are from `first` on, at samples from `begin` on, one row of
     out each from `row` on."""
@@ -163,7 +185,7 @@ def _share(shares, size, first, x, y, z):
 
 
 @njit(**INLINE)
-def _mix(begin, end, mixing, places, parts, sigma):
+def mix(begin, end, mixing, places, parts, sigma):
     """`field.mixture.mix`: parts hold each appearance's density (1/m), and then its part in the
     colour."""
     count, shares, size, filled, cells, numbers = mixing
@@ -197,7 +219,7 @@ def _mix(begin, end, mixing, places, parts, sigma):
 def densities(start, stop, field, mesh_corners, samples, features, inputs, sigma, parts):
     """What the networks see of samples start..stop, their densities (1/m), and each appearance's
     part in the colour where there are several: appearance k has row k * len(sigma) + sample."""
-    encodings, networks, _, latent, untrained, mixing = field
+    encodings, networks, _, latent, numbers, mixing = field
     count, room = mixing[0], len(sigma)
     of_one = len(latent[0]) // count // max(latent[1], 1)
     triangle, places = samples
@@ -223,7 +245,7 @@ def densities(start, stop, field, mesh_corners, samples, features, inputs, sigma
                        plan, no_rows, no_group, density_work)  # fmt: skip
         for k in range(count):
             row = k * room + begin
-            _embed(latent, k * of_one, mesh_corners, triangle, places, begin, n, index, weight,
+            embedding_rows(latent, k * of_one, mesh_corners, triangle, places, begin, n, index, weight,
                    inputs, row, columns)  # fmt: skip
             at, wide = plan[-1, HIDDEN], plan[-1, OUT_PAD]
             for i in range(n):
@@ -238,21 +260,22 @@ def densities(start, stop, field, mesh_corners, samples, features, inputs, sigma
                     inputs[(row + i) * columns + embedding] += offset_work[at + i * wide]
             for i in range(n):
                 raw = inputs[(row + i) * columns + embedding]
-                raw += _untrained(places[DISTANCE, begin + i], untrained)
-                density = np.exp(min(raw, untrained[4])) * np.float32(1e3)
+                raw += untrained(places[DISTANCE, begin + i], numbers)
+                density = np.exp(min(raw, numbers[4])) * np.float32(1e3)
                 if count == 1:
                     sigma[begin + i] = density
                 else:
                     parts[row + i] = density
     if count > 1:
-        _mix(start, stop, mixing, places, parts, sigma)
+        mix(start, stop, mixing, places, parts, sigma)
 
 
 @njit(**INLINE)
-def shade(count, base, views, field, inputs, shown, shown_row, shown_weight, lit, work, out):
+def shade(count, base, views, field, inputs, shown, shown_row, shown_weight, room, out):
     """Add to rows `base` + shown_row of out the colours of `count` samples by their weights, and
     the weights; views [rays, hidden]: what each ray's direction adds to the first layer."""
     plan, packed = field[2]
+    lit, work = room
     columns = columns_of(field)
     zero, one = np.int64(0), np.int64(1)
     group = views[base:]

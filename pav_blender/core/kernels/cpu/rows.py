@@ -46,7 +46,9 @@ def _channels(writer: Writer, width: Any, visit: Any) -> None:
 def _mixer(count: int) -> Any:
     @intrinsic
     def mix(typing, table, width, index, weight, i, out, first):
-        """out[first:first + width] = the weighted sum of sample i's `count` rows of table."""
+        """out[first:first + width] = the weighted sum of sample i's `count` rows of table, in
+        bfloat16 where out is int16."""
+        brief = out.dtype == types.int16
 
         def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
             writer = Writer(context, builder, signature, values)
@@ -63,7 +65,11 @@ def _mixer(count: int) -> Any:
                 for row, share in zip(rows, shares, strict=True):
                     value = writer.load(source, builder.add(row, channel), kind)
                     total = writer.total(total, writer.product(writer.splat(share, kind), value))
-                writer.store(total, target, builder.add(place, channel))
+                at = builder.add(place, channel)
+                if brief:
+                    writer.store_short(writer.as_vector(total), target, at)
+                else:
+                    writer.store(total, target, at)
 
             _channels(writer, columns, visit)
             return context.get_dummy_value()

@@ -33,6 +33,7 @@ LANES, _COUNT = _registers()
 _WIDE_ROWS, _WIDE = (6, 4) if _COUNT == 32 else (6, 2)
 _PAIR_ROWS, _PAIR = (12, 2) if _COUNT == 32 else (6, 2)
 _SINGLE_ROWS = 12
+SHAPES = (_WIDE_ROWS, _WIDE), (_PAIR_ROWS, _PAIR), (_SINGLE_ROWS, 1)
 ROWS = 12  # a multiple of every tile's rows
 _POINTERS = ("out", "init", "a", "b", "mask")
 _ARGUMENTS = (
@@ -41,14 +42,21 @@ _ARGUMENTS = (
 )
 
 
-class _Tile:
+class Tile:
     """Writes the instructions of one tile: out = finish(init + a @ b)."""
 
-    def __init__(self, context: Any, builder: Any, signature: Any, values: Any) -> None:
+    def __init__(
+        self,
+        context: Any,
+        builder: Any,
+        signature: Any,
+        values: Any,
+        names: tuple[str, ...] = _ARGUMENTS,
+    ) -> None:
         self.builder = builder
-        self.given = dict(zip(_ARGUMENTS, values, strict=True))
+        self.given = dict(zip(names, values, strict=True))
         self.vector = ir.VectorType(ir.FloatType(), LANES)
-        for name, kind in zip(_ARGUMENTS, signature.args, strict=True):
+        for name, kind in zip(names, signature.args, strict=True):
             if name in _POINTERS:
                 array = cgutils.create_struct_proxy(kind)(context, builder, self.given[name])
                 self.given[name] = array.data
@@ -142,7 +150,7 @@ def _tile(rows: int, vectors: int) -> Any:
                  a, a_at, a_step, a_stride, b, b_at, b_step, mask, mask_at, mask_step)  # fmt: skip
 
         def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-            writer = _Tile(context, builder, signature, values)
+            writer = Tile(context, builder, signature, values)
             writer.finish(writer.accumulate(rows, vectors), vectors)
             return context.get_dummy_value()
 

@@ -15,21 +15,10 @@ import torch
 from numba import njit
 
 from ..structures import Clearance, PosedMesh, Probing, Traced, Voxels
-from .frozen import (
-    DISTANCE,
-    PLACES,
-    RESTING,
-    ROOM,
-    WEIGHTS,
-    arrays_of,
-    columns_of,
-    densities,
-    features_for,
-    shade,
-)
+from .fields import arrays_of, densities, features_for, inputs_for, shade, shading_room
+from .frozen import DISTANCE, PLACES, RESTING, ROOM, WEIGHTS
 from .lanes import LANES, load, splat_int
 from .marching import clear_cells, flat, locate, rows_of, walk
-from .mlp import BLOCK, workspace
 from .picking import visit
 from .search import INLINE, OPTIONS, STACK
 from .threads import run_chunks
@@ -331,7 +320,6 @@ def _trace(total, walked, space, frames, views, field, lengths_of, limits, outpu
     width, longest = lengths_of[0], lengths_of[2]
     tolerance, transmittance, negligible = limits
     out_colour, out_depth, out_left = outputs
-    columns = columns_of(field)
     most = GROUP * width * longest  # requests of a wave, every run taken apart
     room = most + ROOM
     alive = np.empty(GROUP, np.int32)
@@ -348,13 +336,12 @@ def _trace(total, walked, space, frames, views, field, lengths_of, limits, outpu
     samples = np.zeros(room, np.int32), np.zeros((PLACES, room), np.float32)
     features = features_for(field, most)
     appearances = field[5][0]
-    inputs = np.zeros(appearances * room * columns, np.float32)
+    inputs = inputs_for(field, appearances * room)
     sigma, parts = np.zeros(room, np.float32), np.zeros(appearances * room, np.float32)
     shown = np.zeros(appearances * room, np.int32)
     shown_row = np.zeros(appearances * room, np.int32)
     shown_weight = np.zeros(appearances * room, np.float32)
-    lit = np.zeros((BLOCK + ROOM) * columns, np.float32)
-    colour_work = workspace(field[2][0])
+    shading = shading_room(field)
     evaluations = 0
     for base in range(0, total, GROUP):
         living = 0
@@ -399,6 +386,6 @@ def _trace(total, walked, space, frames, views, field, lengths_of, limits, outpu
                     alive[going_on] = row
                     going_on += 1
             living = going_on
-            shade(showing, base, views, field, inputs, shown, shown_row, shown_weight, lit,
-                  colour_work, out_colour)  # fmt: skip
+            shade(showing, base, views, field, inputs, shown, shown_row, shown_weight,
+                  shading, out_colour)  # fmt: skip
     return evaluations

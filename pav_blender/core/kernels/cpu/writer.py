@@ -45,6 +45,25 @@ class Writer:
         zeros = ir.Constant(ir.VectorType(INT, kind.count), None)
         return self.builder.shuffle_vector(one, undefined, zeros)
 
+    def as_vector(self, value: Any) -> Any:
+        """A number as a vector of one; a vector as it is."""
+        if isinstance(value.type, ir.VectorType):
+            return value
+        return self.splat(value, ir.VectorType(value.type, 1))
+
+    def shortened(self, value: Any) -> Any:
+        """float32 numbers, a vector of them, rounded to bfloat16, in int16."""
+        count = value.type.count
+        whole, short = ir.VectorType(INT, count), ir.VectorType(ir.IntType(16), count)
+        half, moved = (ir.Constant(whole, [n] * count) for n in (0x8000, 16))
+        bits = self.builder.add(self.builder.bitcast(value, whole), half)
+        return self.builder.trunc(self.builder.lshr(bits, moved), short)
+
+    def store_short(self, value: Any, pointer: Any, at: Any) -> None:
+        """Numbers, rounded, into an int16 array from element `at` on."""
+        short = self.shortened(value)
+        self.builder.store(short, self.address(pointer, at, short.type), align=2)
+
     def product(self, a: Any, b: Any) -> Any:
         return self.builder.fmul(a, b, flags=_FUSE)
 
