@@ -13,13 +13,14 @@ import numpy as np
 import torch
 
 from .. import kernels
-from ..kernels.reference.picking import BRICK, cells_from_occupied
+from ..kernels.reference.picking import BRICK, TORN, cells_from_occupied
 from ..kernels.structures import Clearance, PosedMesh, Voxels
 from .occupancy import clearance
 
 _VOXEL = 0.003  # metres
 _STRETCH = 1.4  # of the map from posed to canonical space that is allowed for
 _BESIDE = 2.0  # times the margin of a cube: what is beside it may be torn from it
+_SLACK = 3e-4  # metres that a brick's map is trusted to, beside what its neighbours' differ by
 _SIDES = (16, 8, 4)  # in voxels, of the cubes that are looked at one after the other
 
 
@@ -39,18 +40,19 @@ def voxels(mesh: PosedMesh, space: Clearance, reach: float) -> Voxels:
         middles = low + (places + 0.5) * (size * _VOXEL)
         kept, found = _near_filled(mesh, space, reach, middles, size * _VOXEL)
         places = places[kept]
-    cells = _brick_cells(mesh, space, places, found)
+    cells, maps = _brick_cells(mesh, space, places, found, middles[kept])
     held = (cells >= 0).any(1)
-    places, cells = places[held], cells[held]
+    places, cells, maps = places[held], cells[held], maps[held]
     corner = places.amin(0) if len(places) else torch.zeros(3, dtype=torch.int32)
-    side = int((places - corner).max()) + 1 if len(places) else 1
-    filled = torch.zeros((side,) * 3, dtype=torch.bool)
+    count = int((places - corner).max()) + 1 if len(places) else 1
+    filled = torch.zeros((count,) * 3, dtype=torch.bool)
     at = (places - corner).long().unbind(1)
     filled[at] = True
     bricks = -torch.from_numpy(clearance(filled.numpy())).int()
     bricks[at] = torch.arange(len(places), dtype=torch.int32)
     shape = (-1, BRICK, BRICK, BRICK)
-    return Voxels(bricks, cells.view(shape), low + corner * (BRICK * _VOXEL), 1 / (BRICK * _VOXEL))
+    side = BRICK * _VOXEL
+    return Voxels(bricks, cells.view(shape), low + corner * side, 1 / side, maps)
 
 
 class _Found(NamedTuple):
@@ -78,24 +80,33 @@ def _near_filled(
 
 
 def _brick_cells(
-    mesh: PosedMesh, space: Clearance, places: torch.Tensor, found: _Found
-) -> torch.Tensor:
-    """Canonical cells [N, 64] of bricks at places [N, 3]. Within a brick the map is as good as
-    affine, but for bricks in which the nearest point leaps from one part of the mesh to another:
-    their voxels may lie where a neighbour's map takes them as well."""
+    mesh: PosedMesh,
+    space: Clearance,
+    places: torch.Tensor,
+    found: _Found,
+    middles: torch.Tensor,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Canonical cells [N, 64] of bricks at places [N, 3], and their maps [N, 16] (`Voxels`). Within
+    a brick the map is as good as affine, but for bricks in which the nearest point leaps from one
+    part of the mesh to another: their voxels may lie where a neighbour's map takes them as well."""
     ops = kernels.select("cpu").picking
     maps = _linear(mesh, found.triangle, found.barycentric)
     margin = int(np.ceil(0.87 * BRICK * _VOXEL * _STRETCH / space.cell))
     cells = torch.full((len(places), BRICK**3), -1, dtype=torch.int32)
     own = (found.clear <= margin).nonzero()[:, 0]
     cells[own] = ops.brick_cells(found.canonical[own], maps[own], space, _VOXEL)
+    leaps = torch.zeros(len(cells))
     if len(places):
         corner = places.amin(0) - 1
         at = torch.full(tuple((places.amax(0) - corner + 2).tolist()), -1, dtype=torch.int32)
         where = places - corner
         at[where.long().unbind(1)] = torch.arange(len(places), dtype=torch.int32)
-        ops.add_torn(cells, at, where, found.canonical, maps, space, _VOXEL, margin)
-    return cells
+        leaps = ops.add_torn(cells, at, where, found.canonical, maps, space, _VOXEL, margin)
+    moved = found.canonical[..., None] - maps @ middles[..., None]
+    slack = torch.where(leaps > TORN, torch.inf, leaps + _SLACK)
+    unused = torch.zeros(len(cells), 3)
+    rows = torch.cat([torch.cat([maps, moved], 2).view(-1, 12), slack[:, None], unused], 1)
+    return cells, rows
 
 
 def _linear(mesh: PosedMesh, triangle: torch.Tensor, barycentric: torch.Tensor) -> torch.Tensor:

@@ -56,13 +56,16 @@ class Voxels:
     `bricks[i, j, k]` is a row of `cells`, or where nothing can be minus the chessboard distance in
     bricks to the nearest that has one. `cells` holds each voxel's canonical cell, a flat index into
     the grid of a `Clearance`, or -1. A posed point x lies in brick `floor((x - box_min) * scale)`;
-    outside the box there is nothing.
+    outside the box there is nothing. `maps` holds for each brick an affine map [3, 4] from posed to
+    canonical space, how far its answer may be off (metres, infinite where the mesh is torn), and
+    three numbers that make a row of sixteen.
     """
 
     bricks: torch.Tensor  # [N,N,N] int32
     cells: torch.Tensor  # [B,4,4,4] int32
     box_min: torch.Tensor  # [3] float32, metres
     scale: float  # bricks a metre
+    maps: torch.Tensor  # [B,16] float32
 
     @property
     def box(self) -> torch.Tensor:

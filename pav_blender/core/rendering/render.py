@@ -14,6 +14,7 @@ import torch
 from .. import kernels
 from ..deformation import Clearance, PosedMesh, Thrift, Voxels, voxels
 from ..deformation.rigid import Stance, stance
+from ..cores import threads
 from ..errors import Cancelled, InputError
 from ..field.avatar import Avatar
 from ..field.directions import spherical_harmonics
@@ -27,6 +28,7 @@ from .rays import RayBatch, camera_rays, pack, samples_of, tiled
 from .sparing import passes
 from .wearing import Appearance, Wearing, deformer_of, wearing_of
 
+_LEAST_CHUNK, _SHARES = 1 << 10, 4  # rays a thread takes at a time; times it should
 _FAR_WAVE = 24  # samples a ray between two looks, where every look waits for a device
 _FINEST, _COARSEST = 1e-5, 0.1  # metres between places
 # float32 counts micrometres up to some metres: what is far off is brought near, by whole strides so
@@ -286,10 +288,15 @@ def render_scene(
         picture = Picture(rgba.reshape(*shape, 4), depth.reshape(shape), 0)
         for wanted in passes(picture.rgba, picture.depth, limit, settings.agreement):
             pixels = order[wanted.reshape(-1)[order]]
-            run_chunks(trace, len(pixels), settings.chunk, pixels)
+            run_chunks(trace, len(pixels), _chunk(len(pixels), settings.chunk), pixels)
         if progress is not None:
             progress(1.0)
     return replace(picture, evaluations=evaluations)
+
+
+def _chunk(count: int, most: int) -> int:
+    """How many rays a thread takes at a time, so that all of them have something to do."""
+    return min(most, max(_LEAST_CHUNK, -(-count // (_SHARES * threads()))))
 
 
 def trace_rays(

@@ -184,7 +184,7 @@ def _fetch_corners(typing, table, index, i):
     return types.void(table, index, i), generate
 
 
-@njit(cache=True, nogil=True)
+@njit(nogil=True, _nrt=False)
 def locate_block(unit, count, res, first, mask, table, index, weight):
     """Corners of the `count` points in unit [3 * BLOCK] on one level, and the first ones fetched.
 

@@ -15,9 +15,11 @@ from numba import njit
 from ..structures import Frozen, Layers
 from . import corners, rows
 from .encoding import level_array
+from .exponential import exp
+from .lanes import LANES, load, splat, store
 from .marching import flat, rows_of
 from .mlp import BLOCK, HIDDEN, OUT, OUT_PAD, pack, through_layers, workspace
-from .search import INLINE
+from .search import INLINE, LEAN
 
 # rows of a sample's places: canonical in the unit box, resting with the shoulders, barycentrics,
 # distance from the mesh
@@ -102,7 +104,7 @@ def shading_room(field):
     return np.zeros((BLOCK + ROOM) * columns_of(field), np.float32), workspace(field[2][0])
 
 
-@njit(**INLINE)
+@njit(**LEAN)
 def untrained(distance, settings):
     """`field.Field.untrained`."""
     near = distance / settings[2] - settings[3]
@@ -110,14 +112,12 @@ def untrained(distance, settings):
     return settings[0] + near * settings[1]
 
 
-@njit(**INLINE)
-def _encode(encoding, places, axes, start, count, features, row, scratch):
+@njit(**LEAN)
+def _encode(encoding, places, axes, start, count, features, step, row, scratch):
     """Features of places in the unit box, rows `axes` and on, from sample `start` on; one row each
     from `row` on."""
     table, levels = encoding
     unit, index, weight = scratch
-    step = features.shape[1]
-    flat_features = features.ravel()
     for k in range(len(levels)):
         res, entry, mask, level = levels[k]
         for begin in range(0, count, corners.BLOCK):
@@ -129,10 +129,10 @@ def _encode(encoding, places, axes, start, count, features, row, scratch):
             corners.locate_block(unit, n, res, entry, mask, table, index, weight)
             at = (row + 2 * level) * step + begin
             for i in range(n):
-                corners.read_corners(table, index, weight, i, flat_features, at + i, at + step + i)
+                corners.read_corners(table, index, weight, i, features, at + i, at + step + i)
 
 
-@njit(**INLINE)
+@njit(**LEAN)
 def embedding_rows(surface, first, mesh_corners, triangle, places, begin, count, index, weight, out, row,
            step):  # fmt: skip
     """An appearance's features, which are from `first` on, at samples from `begin` on, one row of
@@ -166,7 +166,7 @@ def embedding_rows(surface, first, mesh_corners, triangle, places, begin, count,
         rows.mix4(latent, width, index, weight, i, out, (row + i) * step)
 
 
-@njit(**INLINE)
+@njit(**LEAN)
 def _share(shares, size, first, x, y, z):
     """A grid's value at a place of the unit box; values are those of the cells' middles."""
     total = np.float32(0)
@@ -184,7 +184,7 @@ def _share(shares, size, first, x, y, z):
     return total
 
 
-@njit(**INLINE)
+@njit(**LEAN)
 def mix(begin, end, mixing, places, parts, sigma):
     """`field.mixture.mix`: parts hold each appearance's density (1/m), and then its part in the
     colour."""
@@ -234,11 +234,12 @@ def densities(start, stop, field, mesh_corners, samples, features, inputs, sigma
     embedding, geometry = latent[1], plan[-1, OUT]
     columns = embedding + geometry
     no_rows, no_group = np.zeros((0, 0), np.float32), np.zeros(0, np.int32)
+    logs = np.zeros(BLOCK + LANES, np.float32)
     zero, one = np.int64(0), np.int64(1)
-    _encode(encodings[0], places, 0, start, stop - start, features, 0, corner_scratch)
+    seen, step = features.ravel(), features.shape[1]
+    _encode(encodings[0], places, 0, start, stop - start, seen, step, 0, corner_scratch)
     rest = 2 * len(encodings[0][1])
-    _encode(encodings[1], places, RESTING, start, stop - start, features, rest, corner_scratch)
-    seen = features.ravel()
+    _encode(encodings[1], places, RESTING, start, stop - start, seen, step, rest, corner_scratch)
     for begin in range(start, stop, BLOCK):
         n = min(BLOCK, stop - begin)
         through_layers(zero, n, n, len(plan), seen, begin - start, one, features.shape[1], packed,
@@ -261,11 +262,11 @@ def densities(start, stop, field, mesh_corners, samples, features, inputs, sigma
             for i in range(n):
                 raw = inputs[(row + i) * columns + embedding]
                 raw += untrained(places[DISTANCE, begin + i], numbers)
-                density = np.exp(min(raw, numbers[4])) * np.float32(1e3)
-                if count == 1:
-                    sigma[begin + i] = density
-                else:
-                    parts[row + i] = density
+                logs[i] = min(raw, numbers[4])
+            if count == 1:
+                to_densities(logs, n, sigma, begin)
+            else:
+                to_densities(logs, n, parts, row)
     if count > 1:
         mix(start, stop, mixing, places, parts, sigma)
 
@@ -287,10 +288,28 @@ def shade(count, base, views, field, inputs, shown, shown_row, shown_weight, roo
                 lit[i * columns + k] = inputs[source + k]
         through_layers(begin, n, n, len(plan), lit, zero, columns, one, packed, plan, group,
                        shown_row, work)  # fmt: skip
-        at, wide = plan[-1, HIDDEN], plan[-1, OUT_PAD]
-        for i in range(n):
-            ray = base + shown_row[begin + i]
-            seen = shown_weight[begin + i]
-            for k in range(3):
-                out[ray, k] += seen / (np.float32(1) + np.exp(-work[at + i * wide + k]))
-            out[ray, 3] += seen
+        at = plan[-1, HIDDEN]
+        add_colours(work[at:], plan[-1, OUT_PAD], n, begin, base, shown_row, shown_weight, out)
+
+
+@njit(**LEAN)
+def add_colours(found, wide, count, begin, base, shown_row, shown_weight, out):
+    """Add to their rays what `count` samples show, from `begin` on: of each the network's answer
+    before it is a colour, in a row of `found` as wide as a vector at least."""
+    one = splat(1.0)
+    for i in range(count):
+        value = load(found, i * wide)
+        store(found, i * wide, one / (one + exp(splat(0.0) - value)))
+        ray = base + shown_row[begin + i]
+        seen = shown_weight[begin + i]
+        for k in range(3):
+            out[ray, k] += seen * found[i * wide + k]
+        out[ray, 3] += seen
+
+
+@njit(**LEAN)
+def to_densities(logs, count, out, begin):
+    """Densities (1/m) of `count` log-densities a millimetre, to out from `begin` on; up to a vector
+    of what follows is overwritten."""
+    for i in range(0, count, LANES):
+        store(out, begin + i, exp(load(logs, i)) * splat(1e3))

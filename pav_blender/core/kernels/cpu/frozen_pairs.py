@@ -17,17 +17,19 @@ from .frozen import (
     DISTANCE,
     RESTING,
     ROOM,
+    add_colours,
     embedding_rows,
     encodings_of,
     latent_of,
     mix,
     mixing_of,
+    to_densities,
     untrained,
     untrained_of,
 )
 from .mlp import BLOCK
 from .pairs import OUT, OUT_PAD, shorten, shorten_row, through_layers
-from .search import INLINE
+from .search import INLINE, LEAN
 from .tiles import LANES
 
 
@@ -81,13 +83,11 @@ def shading_room(field):
     return lit, pairs.workspace(field[2][0])
 
 
-@njit(**INLINE)
-def _encode(encoding, places, axes, start, count, features, row, scratch):
+@njit(**LEAN)
+def _encode(encoding, places, axes, start, count, features, step, row, scratch):
     """As `frozen.encode`, a row for each level's two features."""
     table, levels = encoding
     unit, index, weight = scratch
-    flat_features = features.view(np.int16).ravel()
-    step = 2 * features.shape[1]
     for k in range(len(levels)):
         res, entry, mask, level = levels[k]
         for begin in range(0, count, corners.BLOCK):
@@ -97,9 +97,9 @@ def _encode(encoding, places, axes, start, count, features, row, scratch):
                 for i in range(n):
                     unit[axis * corners.BLOCK + i] = source[i]
             corners.locate_block(unit, n, res, entry, mask, table, index, weight)
-            at = (row + level) * step + 2 * begin
+            at = 2 * ((row + level) * step + begin)
             for i in range(n):
-                corners.read_corners_short(table, index, weight, i, flat_features, at + 2 * i)
+                corners.read_corners_short(table, index, weight, i, features, at + 2 * i)
 
 
 @njit(**INLINE)
@@ -122,16 +122,19 @@ def densities(start, stop, field, mesh_corners, samples, features, inputs, sigma
     half = columns // 2
     first = latent[1] + latent[1] % 2  # the log-density's place
     no_rows, no_group = np.zeros((0, 0), np.float32), np.zeros(0, np.int32)
+    logs = np.zeros(BLOCK + LANES, np.float32)
     zero, one = np.int64(0), np.int64(1)
-    _encode(encodings[0], places, 0, start, stop - start, features, 0, corner_scratch)
-    rest = len(encodings[0][1])
-    _encode(encodings[1], places, RESTING, start, stop - start, features, rest, corner_scratch)
     seen, in_pairs = features.ravel(), inputs[: len(inputs) // 2 * 2].view(np.int32)
+    found_all, step = seen.view(np.int16), features.shape[1]
+    _encode(encodings[0], places, 0, start, stop - start, found_all, step, 0, corner_scratch)
+    rest = len(encodings[0][1])
+    _encode(encodings[1], places, RESTING, start, stop - start, found_all, step, rest,
+            corner_scratch)  # fmt: skip
     for begin in range(start, stop, BLOCK):
         n = min(BLOCK, stop - begin)
-        through_layers(zero, n, seen, begin - start, one, features.shape[1], density, no_rows,
+        through_layers(zero, n, seen, begin - start, one, step, density, no_rows,
                        no_group, density_work)  # fmt: skip
-        found = density_work[1]
+        found = density_work[2]
         for k in range(count):
             row = k * room + begin
             for i in range(n):  # what runs over a row's end is the next one's, written after it
@@ -151,14 +154,14 @@ def densities(start, stop, field, mesh_corners, samples, features, inputs, sigma
             for i in range(n):
                 raw = found[i * wide]
                 if has_offset:
-                    raw += offset_work[1][i * offset[0][-1, OUT_PAD]]
+                    raw += offset_work[2][i * offset[0][-1, OUT_PAD]]
                     shorten(raw, inputs, (row + i) * columns + first)
                 raw += untrained(places[DISTANCE, begin + i], numbers)
-                value = np.exp(min(raw, numbers[4])) * np.float32(1e3)
-                if count == 1:
-                    sigma[begin + i] = value
-                else:
-                    parts[row + i] = value
+                logs[i] = min(raw, numbers[4])
+            if count == 1:
+                to_densities(logs, n, sigma, begin)
+            else:
+                to_densities(logs, n, parts, row)
     if count > 1:
         mix(start, stop, mixing, places, parts, sigma)
 
@@ -180,10 +183,4 @@ def shade(count, base, views, field, inputs, shown, shown_row, shown_weight, roo
             for k in range(half):
                 lit[i * half + k] = source[at + k]
         through_layers(begin, n, lit, zero, half, one, colour, group, shown_row, work)
-        found = work[1]
-        for i in range(n):
-            ray = base + shown_row[begin + i]
-            seen = shown_weight[begin + i]
-            for k in range(3):
-                out[ray, k] += seen / (np.float32(1) + np.exp(-found[i * wide + k]))
-            out[ray, 3] += seen
+        add_colours(work[2], wide, n, begin, base, shown_row, shown_weight, out)

@@ -31,7 +31,7 @@ from .lanes import (
     to_float,
 )
 from .nearest import settle
-from .search import INLINE, OPTIONS, STACK, foot, search
+from .search import LEAN, OPTIONS, STACK, foot, search
 from .threads import run_chunks
 
 __all__ = ["bounds", "canonicalise", "composite", "lattice", "march", "weigh"]
@@ -42,7 +42,7 @@ _TRUST = 0.7
 _MAP = 12  # numbers of a map
 
 
-@njit(**INLINE)
+@njit(**LEAN)
 def _canonical(triangle_maps, vertex_maps, vertices, corners, triangle, wa, wb, wc, x, y, z, row):
     """Canonical place of a posed point; triangle must not be negative. `kernels/structures.py`.
 
@@ -66,14 +66,14 @@ def _canonical(triangle_maps, vertex_maps, vertices, corners, triangle, wa, wb, 
     )
 
 
-@njit(**INLINE)
+@njit(**LEAN)
 def _cell(size, corner, scale, x, y, z):
     """Flat index of the cell that canonical (x, y, z), a place inside the box, lies in."""
     fx, fy, fz = (x - corner[0]) * scale, (y - corner[1]) * scale, (z - corner[2]) * scale
     return (int(fx) * size + int(fy)) * size + int(fz)
 
 
-@njit(**INLINE)
+@njit(**LEAN)
 def clear_cells(grid, size, corner, scale, x, y, z):
     """Cells to the nearest occupied one from canonical (x, y, z): 0 inside an occupied cell."""
     fx, fy, fz = (x - corner[0]) * scale, (y - corner[1]) * scale, (z - corner[2]) * scale
@@ -86,7 +86,7 @@ def clear_cells(grid, size, corner, scale, x, y, z):
     return 1  # on the far face, or not a number
 
 
-@njit(**INLINE)
+@njit(**LEAN)
 def locate(arrays, triangle_maps, vertex_maps, vertices, corners, px, py, pz, going, band,
            stack, scratch, feet, triangle, barycentric, canonical, distances):  # fmt: skip
     """Where the points of a packet lie: triangle [16], barycentric and canonical [3 * 16],

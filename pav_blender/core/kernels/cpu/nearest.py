@@ -10,7 +10,7 @@ from numba import njit
 
 from .lanes import LANES, lane, load, select, splat, splat_int, square_root, store
 from .search import (
-    INLINE,
+    LEAN,
     OPTIONS,
     STACK,
     build_order,
@@ -108,7 +108,7 @@ def refit(topology: Topology, vertices: torch.Tensor) -> Posed:
     return Posed(topology, vertices, torch.from_numpy(usable), arrays)
 
 
-@njit(**INLINE)
+@njit(**LEAN)
 def settle(arrays, found, wa, wb, wc, triangle, barycentric):
     """Triangle [16] and barycentrics [3 * 16] of slots; ties on an edge or vertex settled.
 

@@ -17,7 +17,7 @@ from numba.extending import intrinsic
 
 from ..structures import Layers
 from .mlp import BLOCK
-from .search import INLINE
+from .search import INLINE, LEAN
 from .tiles import LANES, ROWS, SHAPES, Tile
 from .writer import FLOAT, INT, Writer
 
@@ -185,7 +185,7 @@ _WIDE_ROWS, _DOUBLE_ROWS, _SINGLE_ROWS = (rows for rows, _ in SHAPES)
 _WIDE = SHAPES[0][1]
 
 
-@njit(**INLINE)
+@njit(**LEAN)
 def _multiply(rows, columns, depth, out, out_at, out_step, init, init_at, init_step, a, a_at,
               a_step, a_stride, b, b_at, b_step):  # fmt: skip
     """As `tiles.multiply`, depth in pairs."""
@@ -219,21 +219,20 @@ def _multiply(rows, columns, depth, out, out_at, out_step, init, init_at, init_s
 
 @njit(**INLINE)
 def workspace(plan):
-    """Hidden values in bfloat16, results and the first layer's sums in float32; products may read
-    a little past."""
+    """Hidden values in bfloat16, the same in pairs, and in float32 the results and before them the
+    first layer's sums; products may read a little past."""
     room = ROWS * LANES
-    hidden = plan[-1, HIDDEN] + BLOCK * plan[-1, OUT_PAD] + 2 * room
+    hidden = np.zeros(plan[-1, HIDDEN] + BLOCK * plan[-1, OUT_PAD] + 2 * room, np.int16)
     widest = max(plan[0, OUT_PAD], plan[-1, OUT_PAD])
-    return np.zeros(hidden, np.int16), np.zeros(BLOCK * widest + room, np.float32)
+    return hidden, hidden.view(np.int32), np.zeros(BLOCK * widest + room, np.float32)
 
 
-@njit(**INLINE)
+@njit(**LEAN)
 def through_layers(begin, count, x, x_at, x_step, x_stride, network, bias_rows, group, work):
-    """As `mlp.through_layers` for `count` samples, inputs x in pairs; results in work[1], row by
+    """As `mlp.through_layers` for `count` samples, inputs x in pairs; results in work[2], row by
     row as wide as the last layer's padding."""
     plan, weights, biases = network
-    hidden, sums = work
-    pairs = hidden.view(np.int32)
+    hidden, pairs, sums = work
     zero, one = np.int64(0), np.int64(1)
     a, at, step, stride = x, x_at, x_step, x_stride
     for layer in range(len(plan)):

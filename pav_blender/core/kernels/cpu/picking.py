@@ -14,7 +14,7 @@ from ..reference.picking import BRICK, FALL, GOLDEN, LEAST, RISE, TORN
 from ..structures import Clearance, Picks, PosedMesh, Thrift, Voxels
 from .lanes import LANES, load, splat_int
 from .marching import clear_cells, flat, grid_of, locate, rows_of, walk
-from .search import INLINE, OPTIONS, STACK
+from .search import LEAN, OPTIONS, STACK
 from .threads import run_chunks
 
 _CHUNK = 128  # rays a thread takes at a time: a multiple of LANES
@@ -73,7 +73,7 @@ def pick(
     return result
 
 
-@njit(**INLINE)
+@njit(**LEAN)
 def _until(x, d, cell, clear):
     """How far along the ray x leaves the cells that are nearer than `clear` to this one."""
     if d > 0:
@@ -83,7 +83,7 @@ def _until(x, d, cell, clear):
     return np.float32(np.inf)
 
 
-@njit(**INLINE)
+@njit(**LEAN)
 def visit(x, y, z, dx, dy, dz, bricks, brick_count):
     """The flat voxel of a place (x, y, z), in bricks, or -1 where there is none; and how far along
     the direction (dx, dy, dz) there will be none either."""
@@ -101,7 +101,7 @@ def visit(x, y, z, dx, dy, dz, bricks, brick_count):
     return np.int64(((row * BRICK + u) * BRICK + v) * BRICK + w), nothing
 
 
-@njit(**INLINE)
+@njit(**LEAN)
 def _choose(ray, first, last, origins, directions, jitter, step, bricks, brick_count, cells, corner,
             scale, guide, chance, left, share, longest, opaque, width, k_out,
             steps_out):  # fmt: skip
@@ -144,7 +144,7 @@ def _choose(ray, first, last, origins, directions, jitter, step, bricks, brick_c
     return count, looks, k
 
 
-@njit(**INLINE)
+@njit(**LEAN)
 def _close(k_out, steps_out, count, begin, length, chance):
     """One of the places taken together becomes a sample."""
     k_out[count] = begin + min(int(chance * np.float32(length)), length - 1)
@@ -237,7 +237,7 @@ def brick_cells(
     return cells
 
 
-@njit(**INLINE)
+@njit(**LEAN)
 def _cell_near(grid, size, corner, scale, x, y, z):
     """The cell of canonical (x, y, z), or the nearest, and how many cells off a filled one is."""
     flat, far = 0, 0
@@ -250,7 +250,7 @@ def _cell_near(grid, size, corner, scale, x, y, z):
     return flat, max(far, int(grid[flat]))
 
 
-@njit(**INLINE)
+@njit(**LEAN)
 def _fill(out, x, y, z, linear, grid, size, corner, scale, voxel):
     """Cells of a brick's voxels that have none yet, its middle lying at canonical (x, y, z)."""
     for i in range(BRICK**3):
@@ -285,8 +285,9 @@ def add_torn(
     space: Clearance,
     voxel: float,
     margin: int,
-) -> None:
+) -> torch.Tensor:
     """As the reference, up to the rounding of the places."""
+    leaps = torch.zeros(len(cells))
     run_chunks(
         _add_torn,
         len(cells),
@@ -299,12 +300,14 @@ def add_torn(
         np.float32(voxel),
         margin,
         cells.numpy(),
+        leaps.numpy(),
     )
+    return leaps
 
 
 @njit(**OPTIONS)
 def _add_torn(start, stop, at, places, canonical, maps, grid, size, corner, scale, voxel, margin,
-              out):  # fmt: skip
+              out, leaps):  # fmt: skip
     side = np.float32(BRICK) * voxel
     for brick in range(start, stop):
         for axis in range(3):
@@ -320,6 +323,7 @@ def _add_torn(start, stop, at, places, canonical, maps, grid, size, corner, scal
                 z = canonical[beside, 2] - back * maps[beside, 2, axis]
                 leap = max(abs(x - canonical[brick, 0]), abs(y - canonical[brick, 1]),
                            abs(z - canonical[brick, 2]))  # fmt: skip
+                leaps[brick] = max(leaps[brick], leap)
                 if leap > np.float32(TORN) and (
                     _cell_near(grid, size, corner, scale, x, y, z)[1] <= margin
                 ):

@@ -34,6 +34,9 @@ from .lanes import (
 
 OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
 INLINE: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
+# for what makes no arrays: they are not counted on the way in and out, which took a tenth of the
+# time of small functions that are given many
+LEAN: dict[str, Any] = {**INLINE, "_nrt": False}
 
 # Floats of a triangle in `records`: corner a, axes X, Y, N of its plane, then in plane coordinates
 # (a at 0, b at (length, 0), c at (cx, cy)) length, cx, cy, 1/|ac|^2, 1/|bc|^2, 1/length, 1/cy.
@@ -156,17 +159,17 @@ def fit_levels(boxes, starts):
                 boxes[target + (axis + 3) * LANES] = high
 
 
-@njit(**INLINE)
+@njit(**LEAN)
 def _clamp(x):
     return minimum(maximum(x, splat(0.0)), splat(1.0))
 
 
-@njit(**INLINE)
+@njit(**LEAN)
 def _to_plane(x, y, z, dx, dy, dz):
     return fma(z, dz, fma(y, dy, x * dx))
 
 
-@njit(**INLINE)
+@njit(**LEAN)
 def _in_plane(x, y, z, length, cx, cy, inverse_ac, inverse_bc, inverse_length, inverse_cy):
     """Squared distance of plane coordinates (x, y, height z), barycentrics of the nearest point.
 
@@ -199,7 +202,7 @@ def _in_plane(x, y, z, length, cx, cy, inverse_ac, inverse_bc, inverse_length, i
     return fma(z, z, best), wa, wb, wc
 
 
-@njit(**INLINE)
+@njit(**LEAN)
 def measure(records, slot, px, py, pz):
     """Squared distance of the packet's points to the triangle in one slot."""
     r = slot * RECORD
@@ -222,7 +225,7 @@ def measure(records, slot, px, py, pz):
     return squared
 
 
-@njit(**INLINE)
+@njit(**LEAN)
 def foot(records, slots, px, py, pz):
     """Each point's nearest point on the triangle in its own slot: barycentrics, then the place."""
     r = slots * splat_int(RECORD)
@@ -250,13 +253,13 @@ def foot(records, slots, px, py, pz):
     return wa, wb, wc, qx, qy, qz
 
 
-@njit(**INLINE)
+@njit(**LEAN)
 def _gap(low, high, least, greatest):
     """How far apart two intervals are, 0 where they meet."""
     return maximum(maximum(low - greatest, least - high), splat(0.0))
 
 
-@njit(**INLINE)
+@njit(**LEAN)
 def _packet_distances(boxes, start, lx, ly, lz, hx, hy, hz):
     """Squared distance of the packet's box to the children of the node at `start`."""
     dx = _gap(load(boxes, start), load(boxes, start + 3 * LANES), lx, hx)
@@ -265,7 +268,7 @@ def _packet_distances(boxes, start, lx, ly, lz, hx, hy, hz):
     return fma(dx, dx, fma(dy, dy, dz * dz))
 
 
-@njit(**INLINE)
+@njit(**LEAN)
 def _may_hold(boxes, at, px, py, pz, bound):
     """Whether any point is nearer than its bound to the box whose numbers begin at `at`."""
     dx = _gap(splat(boxes[at]), splat(boxes[at + 3 * LANES]), px, px)
@@ -274,7 +277,7 @@ def _may_hold(boxes, at, px, py, pz, bound):
     return bits(fma(dx, dx, fma(dy, dy, dz * dz)) <= bound) != 0
 
 
-@njit(**INLINE)
+@njit(**LEAN)
 def search(boxes, starts, records, px, py, pz, best, found, stack, scratch):
     """Squared distance and slot of the triangle nearest to each point (all must be finite).
 

@@ -17,15 +17,16 @@ from numba import njit
 from ..structures import Clearance, PosedMesh, Probing, Traced, Voxels
 from .fields import arrays_of, densities, features_for, inputs_for, shade, shading_room
 from .frozen import DISTANCE, PLACES, RESTING, ROOM, WEIGHTS
-from .lanes import LANES, load, splat_int
+from .lanes import LANES, fma, load, maximum, minimum, splat, splat_int, store
 from .marching import clear_cells, flat, locate, rows_of, walk
 from .picking import visit
-from .search import INLINE, OPTIONS, STACK
+from .search import LEAN, OPTIONS, STACK
 from .threads import run_chunks
 
 __all__ = ["arrays_of", "known_density", "trace"]
 
 GROUP = 256  # rays that advance together
+_MAP = 16  # numbers of a brick's map
 _NONE, _WANTED = -1, -2
 
 
@@ -79,6 +80,7 @@ def trace(
         flat(known),
         flat(voxels.box_min),
         np.float32(voxels.scale),
+        flat(voxels.maps),
     )
     unit = flat(clearance.box_min), np.float32(clearance.box_scale)
     evaluations = _trace(
@@ -102,7 +104,7 @@ def trace(
     return traced._replace(evaluations=evaluations)
 
 
-@njit(**INLINE)
+@njit(**LEAN)
 def _runs(ray, first, last, rays, space, left, lengths_of, begins,
             lengths):  # fmt: skip
     """Places of one ray in runs, each looked at in its middle: how many runs, where to go on.
@@ -111,7 +113,7 @@ def _runs(ray, first, last, rays, space, left, lengths_of, begins,
     `share` to the pixel by the guide.
     """
     origins, directions, step = rays
-    bricks, brick_count, thin, corner, scale = space
+    bricks, brick_count, thin, corner, scale, _ = space
     width, share, longest, probe = lengths_of
     ox = (origins[ray, 0] - corner[0]) * scale
     oy = (origins[ray, 1] - corner[1]) * scale
@@ -146,38 +148,101 @@ def _runs(ray, first, last, rays, space, left, lengths_of, begins,
     return count + 1, k
 
 
-@njit(**INLINE)
-def _find(start, stop, base, asked, count, rays, surface, grid, frames, feet, samples):
-    """Where requests start..stop lie: each gets a sample, from `count` on, or -1 where nothing can
-    be; returns how many samples there are then."""
+@njit(**LEAN)
+def _filled_near(x, y, z, voxels, grid):
+    """Whether there may be anything at a posed place, by the map of the brick that it is in: a look
+    at a table, which spares most of the searches that would find nothing."""
+    bricks, brick_count, maps, corner, scale = voxels
+    cells, size, grid_corner, grid_scale = grid
+    u = (np.int64((x - corner[0]) * scale) * brick_count + np.int64((y - corner[1]) * scale))
+    row = bricks[u * brick_count + np.int64((z - corner[2]) * scale)]
+    if row < 0:
+        return True
+    at = row * _MAP
+    slack = maps[at + 12] * grid_scale  # in cells
+    if not slack < 1:
+        return True
+    cx = maps[at] * x + maps[at + 1] * y + maps[at + 2] * z + maps[at + 3]
+    cy = maps[at + 4] * x + maps[at + 5] * y + maps[at + 6] * z + maps[at + 7]
+    cz = maps[at + 8] * x + maps[at + 9] * y + maps[at + 10] * z + maps[at + 11]
+    cx = (cx - grid_corner[0]) * grid_scale
+    cy = (cy - grid_corner[1]) * grid_scale
+    cz = (cz - grid_corner[2]) * grid_scale
+    last = np.float32(size) - np.float32(0.5)
+    if not (min(cx, cy, cz) > -1 and max(cx, cy, cz) < size + 1):
+        return False
+    nothing = np.float32(0)
+    i = np.int64(min(max(cx, nothing), last))
+    j = np.int64(min(max(cy, nothing), last))
+    k = np.int64(min(max(cz, nothing), last))
+    clear = cells[(i * size + j) * size + k]
+    if clear != 1:
+        return clear == 0
+    i0, i1 = np.int64(max(cx - slack, nothing)), np.int64(min(cx + slack, last))
+    j0, j1 = np.int64(max(cy - slack, nothing)), np.int64(min(cy + slack, last))
+    k0, k1 = np.int64(max(cz - slack, nothing)), np.int64(min(cz + slack, last))
+    for i in range(i0, i1 + 1):
+        for j in range(j0, j1 + 1):
+            for k in range(k0, k1 + 1):
+                if cells[(i * size + j) * size + k] == 0:
+                    return True
+    return False
+
+
+@njit(**LEAN)
+def _point_at(start, stop, base, asked, rays, voxels, grid, points, wanted):
+    """Places [3, N] of those of requests start..stop where there may be anything, and which
+    requests these are; returns how many."""
     origins, directions, step = rays
+    want_row, want_k, sample_of = asked[0], asked[1], asked[2]
+    count = 0
+    for request in range(start, stop):
+        sample_of[request] = -1
+        ray = base + want_row[request]
+        t = (np.float32(want_k[request]) + np.float32(0.5)) * step
+        x = origins[ray, 0] + t * directions[ray, 0]
+        y = origins[ray, 1] + t * directions[ray, 1]
+        z = origins[ray, 2] + t * directions[ray, 2]
+        if _filled_near(x, y, z, voxels, grid):
+            points[0, count], points[1, count], points[2, count] = x, y, z
+            wanted[count] = request
+            count += 1
+    for i in range(count, -(-count // LANES) * LANES):  # a whole packet
+        points[0, i], points[1, i], points[2, i] = points[:, count - 1]
+    return count
+
+
+@njit(**LEAN)
+def _find(requests, wanted, points, asked, count, surface, grid, frames, feet, samples, room):
+    """Where the points of `requests` requests lie: each gets a sample, from `count` on, or none
+    where nothing can be; returns how many samples there are then."""
     arrays, triangle_maps, vertex_maps, vertices, mesh_corners, band = surface
     cells, size, grid_corner, grid_scale = grid
     unit_corner, unit_scale, still = frames
-    want_row, want_k, sample_of = asked[0], asked[1], asked[2]
-    stack, scratch = np.empty(STACK, np.int32), np.empty(LANES, np.float32)
-    points, near = np.empty(3 * LANES, np.float32), np.full(3 * LANES, np.inf, np.float32)
-    canonical, weights = np.empty(3 * LANES, np.float32), np.empty(3 * LANES, np.float32)
-    distances, found = np.empty(LANES, np.float32), np.empty(LANES, np.int32)
+    want_row, sample_of = asked[0], asked[2]
+    stack, scratch, near, weights, canonical, rest, distances, found = room
     triangle, places = samples
-    for begin in range(start, stop, LANES):
-        lanes = min(LANES, stop - begin)
-        for i in range(LANES):
-            row = want_row[begin + min(i, lanes - 1)]
-            t = (np.float32(want_k[begin + min(i, lanes - 1)]) + np.float32(0.5)) * step
-            known = feet[row, 0] < np.inf  # else a neighbour's nearest point is a bound as well
-            for axis in range(3):
-                along = t * directions[base + row, axis]
-                points[axis * LANES + i] = origins[base + row, axis] + along
-                if known:
+    zero, one = splat(0.0), splat(1.0)
+    for begin in range(0, requests, LANES):
+        lanes = min(LANES, requests - begin)
+        for i in range(lanes):
+            row = want_row[wanted[begin + i]]
+            if feet[row, 0] < np.inf:  # else a neighbour's nearest point is a bound as well
+                for axis in range(3):
                     near[axis * LANES + i] = feet[row, axis]
-        px, py, pz = load(points, 0), load(points, LANES), load(points, 2 * LANES)
+        px, py, pz = load(points[0], begin), load(points[1], begin), load(points[2], begin)
         locate(arrays, triangle_maps, vertex_maps, vertices, mesh_corners, px, py, pz,
                splat_int(0) < splat_int(1), band, stack, scratch, near, found, weights, canonical,
                distances)  # fmt: skip
+        for axis in range(3):
+            place = (load(canonical, axis * LANES) - splat(unit_corner[axis])) * splat(unit_scale)
+            store(rest, axis * LANES, minimum(maximum(place, zero), one))
+            place = fma(px, splat(still[axis, 0]), splat(still[axis, 3]))
+            place = fma(pz, splat(still[axis, 2]), fma(py, splat(still[axis, 1]), place))
+            place = (place - splat(unit_corner[axis])) * splat(unit_scale)
+            store(rest, (3 + axis) * LANES, minimum(maximum(place, zero), one))
         for i in range(lanes):
-            sample_of[begin + i] = -1
-            row = want_row[begin + i]
+            row = want_row[wanted[begin + i]]
             for axis in range(3):
                 feet[row, axis] = near[axis * LANES + i]
             if found[i] < 0 or not distances[i] <= band:
@@ -185,23 +250,18 @@ def _find(start, stop, base, asked, count, rays, surface, grid, frames, feet, sa
             x, y, z = canonical[i], canonical[LANES + i], canonical[2 * LANES + i]
             if clear_cells(cells, size, grid_corner, grid_scale, x, y, z) > 0:
                 continue
-            sample_of[begin + i] = count
+            sample_of[wanted[begin + i]] = count
             triangle[count] = found[i]
             places[DISTANCE, count] = distances[i]
             for axis in range(3):
+                places[axis, count] = rest[axis * LANES + i]
+                places[RESTING + axis, count] = rest[(3 + axis) * LANES + i]
                 places[WEIGHTS + axis, count] = weights[axis * LANES + i]
-                place = (canonical[axis * LANES + i] - unit_corner[axis]) * unit_scale
-                places[axis, count] = min(max(place, np.float32(0)), np.float32(1))
-                place = still[axis, 3]
-                for k in range(3):
-                    place += still[axis, k] * points[k * LANES + i]
-                place = (place - unit_corner[axis]) * unit_scale
-                places[RESTING + axis, count] = min(max(place, np.float32(0)), np.float32(1))
             count += 1
     return count
 
 
-@njit(**INLINE)
+@njit(**LEAN)
 def _ask_middles(living, alive, chosen, runs, asked):
     """The middles of all runs, sixteen rays side by side; returns how many."""
     begins, lengths, middle, before, after = runs[0], runs[1], runs[2], runs[3], runs[4]
@@ -219,7 +279,7 @@ def _ask_middles(living, alive, chosen, runs, asked):
     return count
 
 
-@njit(**INLINE)
+@njit(**LEAN)
 def _mark(
     living, alive, base, chosen, runs, sample_of, sigma, step, lefts, tolerance, transmittance
 ):
@@ -245,7 +305,7 @@ def _mark(
                 break
 
 
-@njit(**INLINE)
+@njit(**LEAN)
 def _ask_rest(living, alive, chosen, runs, asked, count):
     """The places beside the middles of marked runs; returns how many requests there are then."""
     begins, lengths, before, after = runs[0], runs[1], runs[3], runs[4]
@@ -268,7 +328,7 @@ def _ask_rest(living, alive, chosen, runs, asked, count):
     return count
 
 
-@njit(**INLINE)
+@njit(**LEAN)
 def _add_up(a, ray, chosen, runs, asked, sigma, parts, appearances, step, left, depth, negligible,
             row, showing, shown, shown_row, shown_weight):  # fmt: skip
     """One ray through its samples: what is left of it, its depth, and how many samples show, each
@@ -317,6 +377,7 @@ def _trace(total, walked, space, frames, views, field, lengths_of, limits, outpu
     surface = arrays, triangle_maps, vertex_maps, vertices, mesh_corners, band
     rays = origins, directions, step
     grid = cells, size, grid_corner, grid_scale
+    voxels = space[0], space[1], space[5], space[3], space[4]
     width, longest = lengths_of[0], lengths_of[2]
     tolerance, transmittance, negligible = limits
     out_colour, out_depth, out_left = outputs
@@ -334,6 +395,17 @@ def _trace(total, walked, space, frames, views, field, lengths_of, limits, outpu
     # triangles; canonical places in the unit box, those that rest with the shoulders, barycentrics,
     # distances (`frozen`)
     samples = np.zeros(room, np.int32), np.zeros((PLACES, room), np.float32)
+    points, wanted = np.zeros((3, most + LANES), np.float32), np.zeros(most, np.int32)
+    packet = (
+        np.empty(STACK, np.int32),
+        np.empty(LANES, np.float32),
+        np.full(3 * LANES, np.inf, np.float32),
+        np.empty(3 * LANES, np.float32),
+        np.empty(3 * LANES, np.float32),
+        np.empty(6 * LANES, np.float32),
+        np.empty(LANES, np.float32),
+        np.empty(LANES, np.int32),
+    )
     features = features_for(field, most)
     appearances = field[5][0]
     inputs = inputs_for(field, appearances * room)
@@ -368,8 +440,9 @@ def _trace(total, walked, space, frames, views, field, lengths_of, limits, outpu
                 else:
                     break
                 begin = count
-                count = _find(known, requests, base, asked, begin, rays, surface, grid, frames,
-                              feet, samples)  # fmt: skip
+                found = _point_at(known, requests, base, asked, rays, voxels, grid, points, wanted)
+                count = _find(found, wanted, points, asked, begin, surface, grid, frames, feet,
+                              samples, packet)  # fmt: skip
                 densities(begin, count, field, mesh_corners, samples, features, inputs, sigma,
                           parts)  # fmt: skip
             evaluations += count

@@ -196,16 +196,18 @@ def add_torn(
     space: Clearance,
     voxel: float,
     margin: int,
-) -> None:
+) -> torch.Tensor:
     """Where the nearest point leaps from one part of a mesh to another between two bricks, the
     map of each may hold in part of the other: cells [N, 64] are set, in place, where they have
     none, to what the maps of torn neighbours say.
 
     at: rows of bricks in a grid with a free border, -1 where there is none; places [N, 3]: where
     each is in it; canonical, maps, voxel as in `brick_cells`; margin: cells from an occupied one
-    beyond which nothing in a brick can be.
+    beyond which nothing in a brick can be. Returns how far [N], in metres, a brick's middle is at
+    most from where the maps beside it take it.
     """
     side = BRICK * voxel
+    leaps = canonical.new_zeros(len(cells))
     for axis in range(3):
         for sign in (1, -1):
             step = torch.zeros(3, dtype=places.dtype, device=places.device)
@@ -214,11 +216,14 @@ def add_torn(
             bricks = (beside >= 0).nonzero()[:, 0]
             beside = beside[bricks]
             there = canonical[beside] - sign * side * maps[beside, :, axis]
-            torn = (there - canonical[bricks]).abs().amax(1) > TORN
+            leap = (there - canonical[bricks]).abs().amax(1)
+            leaps[bricks] = torch.maximum(leaps[bricks], leap)
+            torn = leap > TORN
             torn &= cells_from_occupied(there, space) <= margin
             bricks, beside, there = bricks[torn], beside[torn], there[torn]
             found = brick_cells(there, maps[beside], space, voxel)
             cells[bricks] = torch.where(cells[bricks] < 0, found, cells[bricks])
+    return leaps
 
 
 def follow(guide: torch.Tensor, cells: torch.Tensor, density: torch.Tensor) -> None:
