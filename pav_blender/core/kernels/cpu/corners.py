@@ -42,6 +42,25 @@ def _fetch(writer: Writer, table: Any, index: Any, i: Any) -> None:
         writer.fetch(table, _entry(writer, index, later, corner))
 
 
+def _cells(writer: Writer, points: Any, at: Any, cells: Any) -> tuple[list[Any], ...]:
+    """Of samples at, at + 1, ..., along each axis: the cell, and the weights of its two ends."""
+    builder = writer.builder
+    scale = writer.splat(builder.sitofp(cells, FLOAT), _FLOATS)
+    last = writer.splat(builder.sub(cells, INT(1)), _INTS)
+    one = ir.Constant(_FLOATS, [1.0] * LANES)
+    cell, near, far = [], [], []
+    for axis in range(3):
+        here = builder.add(at, LONG(axis * BLOCK))
+        position = builder.fmul(writer.load(points, here, _FLOATS), scale)
+        whole = builder.fptosi(position, _INTS)
+        whole = builder.select(builder.icmp_signed("<", whole, last), whole, last)
+        fraction = builder.fsub(position, builder.sitofp(whole, _FLOATS))
+        cell.append(whole)
+        far.append(fraction)
+        near.append(builder.fsub(one, fraction))
+    return cell, near, far
+
+
 def _locator(hashed: bool) -> Any:
     @intrinsic
     def locate(typing, unit, i, res, first, mask, index, weight):
@@ -51,19 +70,7 @@ def _locator(hashed: bool) -> Any:
             writer = Writer(context, builder, signature, values)
             points, at, cells, start, bits, indices, weights = writer.values
             cells, start, bits = (builder.trunc(v, INT) for v in (cells, start, bits))
-            scale = writer.splat(builder.sitofp(cells, FLOAT), _FLOATS)
-            last = writer.splat(builder.sub(cells, INT(1)), _INTS)
-            one = ir.Constant(_FLOATS, [1.0] * LANES)
-            cell, near, far = [], [], []
-            for axis in range(3):
-                here = builder.add(at, LONG(axis * BLOCK))
-                position = builder.fmul(writer.load(points, here, _FLOATS), scale)
-                whole = builder.fptosi(position, _INTS)
-                whole = builder.select(builder.icmp_signed("<", whole, last), whole, last)
-                fraction = builder.fsub(position, builder.sitofp(whole, _FLOATS))
-                cell.append(whole)
-                far.append(fraction)
-                near.append(builder.fsub(one, fraction))
+            cell, near, far = _cells(writer, points, at, cells)
             entries = (_hashed if hashed else _dense)(writer, cell, cells, bits)
             begin = writer.splat(start, _INTS)
             for corner in range(8):
@@ -123,32 +130,80 @@ def _both(writer: Writer, entries: Any, indices: Any, weights: Any, at: Any) -> 
     return writer.builder.fadd(*sums)
 
 
+def _put(writer: Writer, both: Any, kind: Any, target: Any, places: Any) -> None:
+    """Write two features: into int16 side by side, rounded to bfloat16, else each in its place."""
+    if kind.dtype == types.int16:
+        writer.store_short(both, target, places[0])
+        return
+    for feature, place in enumerate(places):
+        writer.store(writer.builder.extract_element(both, INT(feature)), target, place)
+
+
 @intrinsic
 def read_corners(typing, table, index, weight, i, out, first, second):
-    """Write the two features of sample i to out, at `first` and at `second`."""
+    """Write the two features of sample i to out, at `first` and at `second`; an int16 array gets
+    them in bfloat16, both from `first` on."""
 
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         writer = Writer(context, builder, signature, values)
         entries, indices, weights, at, target, *places = writer.values
         both = _both(writer, entries, indices, weights, at)
-        for feature, place in enumerate(places):
-            writer.store(builder.extract_element(both, INT(feature)), target, place)
+        _put(writer, both, signature.args[4], target, places)
         return context.get_dummy_value()
 
     return types.void(table, index, weight, i, out, first, second), generate
 
 
 @intrinsic
-def read_corners_short(typing, table, index, weight, i, out, at):
-    """Write the two features of sample i to the int16 array out, in bfloat16, from `at` on."""
+def _locate_edges(typing, unit, i, res, first, index, weight):
+    """As `_locate_dense`, of the four edges along x round samples i, i + 1, ...: the entry of the
+    lower end, the weight of each, and after these how far along it the samples lie."""
 
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         writer = Writer(context, builder, signature, values)
-        entries, indices, weights, sample, target, place = writer.values
-        writer.store_short(_both(writer, entries, indices, weights, sample), target, place)
+        points, at, cells, start, indices, weights = writer.values
+        cells, start = (builder.trunc(v, INT) for v in (cells, start))
+        cell, near, far = _cells(writer, points, at, cells)
+        entries = _dense(writer, cell, cells, None)
+        begin = writer.splat(start, _INTS)
+        for edge in range(4):
+            y, z = ((far if edge >> bit & 1 else near)[bit + 1] for bit in range(2))
+            here = builder.add(at, LONG(edge * STRIDE))
+            writer.store(writer.product(y, z), weights, here)
+            writer.store(builder.add(entries[2 * edge], begin), indices, here)
+        writer.store(far[0], weights, builder.add(at, LONG(4 * STRIDE)))
         return context.get_dummy_value()
 
-    return types.void(table, index, weight, i, out, at), generate
+    return types.void(unit, i, res, first, index, weight), generate
+
+
+@intrinsic
+def read_edges(typing, table, index, weight, i, out, first, second):
+    """As `read_corners`, on a dense level that `locate_edges` looked at: both ends of an edge lie
+    side by side."""
+
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        writer = Writer(context, builder, signature, values)
+        entries, indices, weights, at, target, *places = writer.values
+        ends = ir.VectorType(FLOAT, 4)
+        total = ir.Constant(ends, None)
+        for edge in range(4):
+            here = builder.add(at, LONG(edge * STRIDE))
+            share = writer.splat(writer.load(weights, here, FLOAT), ends)
+            entry = builder.shl(builder.zext(writer.load(indices, here, INT), LONG), LONG(1))
+            total = writer.total(total, writer.product(share, writer.load(entries, entry, ends)))
+        low, high = (
+            builder.shuffle_vector(
+                total, total, ir.Constant(ir.VectorType(INT, 2), [end, end + 1])
+            )
+            for end in (0, 2)
+        )
+        along = writer.load(weights, builder.add(at, LONG(4 * STRIDE)), FLOAT)
+        step = writer.product(writer.splat(along, _PAIR), builder.fsub(high, low))
+        _put(writer, writer.total(low, step), signature.args[4], target, places)
+        return context.get_dummy_value()
+
+    return types.void(table, index, weight, i, out, first, second), generate
 
 
 @intrinsic
@@ -199,3 +254,11 @@ def locate_block(unit, count, res, first, mask, table, index, weight):
             _locate_hashed(unit, i, res, first, mask, index, weight)
     for i in range(-AHEAD, 0):
         _fetch_corners(table, index, i)
+
+
+@njit(nogil=True, _nrt=False)
+def locate_edges(unit, count, res, first, index, weight):
+    """Edges along x round the `count` points in unit [3 * BLOCK] on a dense level, for
+    `read_edges`; index [4 * STRIDE] and weight [5 * STRIDE] receive them."""
+    for i in range(0, count, LANES):
+        _locate_edges(unit, i, res, first, index, weight)

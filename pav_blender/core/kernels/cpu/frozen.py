@@ -113,11 +113,15 @@ def untrained(distance, settings):
 
 
 @njit(**LEAN)
-def _encode(encoding, places, axes, start, count, features, step, row, scratch):
-    """Features of places in the unit box, rows `axes` and on, from sample `start` on; one row each
-    from `row` on."""
+def encode(encoding, places, axes, start, count, features, at, steps, scratch):
+    """Features of places in the unit box, rows `axes` and on, from sample `start` on.
+
+    They go to `features` from `at` on; steps: from level to level, from sample to sample, and from
+    the first feature to the second.
+    """
     table, levels = encoding
     unit, index, weight = scratch
+    to_level, to_sample, to_second = steps
     for k in range(len(levels)):
         res, entry, mask, level = levels[k]
         for begin in range(0, count, corners.BLOCK):
@@ -126,10 +130,17 @@ def _encode(encoding, places, axes, start, count, features, step, row, scratch):
                 source = places[axes + axis, start + begin : start + begin + n]
                 for i in range(n):
                     unit[axis * corners.BLOCK + i] = source[i]
-            corners.locate_block(unit, n, res, entry, mask, table, index, weight)
-            at = (row + 2 * level) * step + begin
-            for i in range(n):
-                corners.read_corners(table, index, weight, i, features, at + i, at + step + i)
+            first = at + level * to_level + begin * to_sample
+            if mask == 0:
+                corners.locate_edges(unit, n, res, entry, index, weight)
+                for i in range(n):
+                    here = first + i * to_sample
+                    corners.read_edges(table, index, weight, i, features, here, here + to_second)
+            else:
+                corners.locate_block(unit, n, res, entry, mask, table, index, weight)
+                for i in range(n):
+                    here = first + i * to_sample
+                    corners.read_corners(table, index, weight, i, features, here, here + to_second)
 
 
 @njit(**LEAN)
@@ -237,9 +248,9 @@ def densities(start, stop, field, mesh_corners, samples, features, inputs, sigma
     logs = np.zeros(BLOCK + LANES, np.float32)
     zero, one = np.int64(0), np.int64(1)
     seen, step = features.ravel(), features.shape[1]
-    _encode(encodings[0], places, 0, start, stop - start, seen, step, 0, corner_scratch)
-    rest = 2 * len(encodings[0][1])
-    _encode(encodings[1], places, RESTING, start, stop - start, seen, step, rest, corner_scratch)
+    steps, rest = (2 * step, one, step), 2 * step * len(encodings[0][1])
+    encode(encodings[0], places, 0, start, stop - start, seen, zero, steps, corner_scratch)
+    encode(encodings[1], places, RESTING, start, stop - start, seen, rest, steps, corner_scratch)
     for begin in range(start, stop, BLOCK):
         n = min(BLOCK, stop - begin)
         through_layers(zero, n, n, len(plan), seen, begin - start, one, features.shape[1], packed,

@@ -19,6 +19,7 @@ from .frozen import (
     ROOM,
     add_colours,
     embedding_rows,
+    encode,
     encodings_of,
     latent_of,
     mix,
@@ -29,7 +30,7 @@ from .frozen import (
 )
 from .mlp import BLOCK
 from .pairs import OUT, OUT_PAD, shorten, shorten_row, through_layers
-from .search import INLINE, LEAN
+from .search import INLINE
 from .tiles import LANES
 
 
@@ -83,25 +84,6 @@ def shading_room(field):
     return lit, pairs.workspace(field[2][0])
 
 
-@njit(**LEAN)
-def _encode(encoding, places, axes, start, count, features, step, row, scratch):
-    """As `frozen.encode`, a row for each level's two features."""
-    table, levels = encoding
-    unit, index, weight = scratch
-    for k in range(len(levels)):
-        res, entry, mask, level = levels[k]
-        for begin in range(0, count, corners.BLOCK):
-            n = min(corners.BLOCK, count - begin)
-            for axis in range(3):
-                source = places[axes + axis, start + begin : start + begin + n]
-                for i in range(n):
-                    unit[axis * corners.BLOCK + i] = source[i]
-            corners.locate_block(unit, n, res, entry, mask, table, index, weight)
-            at = 2 * ((row + level) * step + begin)
-            for i in range(n):
-                corners.read_corners_short(table, index, weight, i, features, at + 2 * i)
-
-
 @njit(**INLINE)
 def densities(start, stop, field, mesh_corners, samples, features, inputs, sigma, parts):
     """As `frozen.densities`."""
@@ -121,15 +103,14 @@ def densities(start, stop, field, mesh_corners, samples, features, inputs, sigma
     columns = columns_of(field)
     half = columns // 2
     first = latent[1] + latent[1] % 2  # the log-density's place
-    no_rows, no_group = np.zeros((0, 0), np.float32), np.zeros(0, np.int32)
+    no_rows, no_group = np.zeros(0, np.float32), np.zeros(0, np.int32)
     logs = np.zeros(BLOCK + LANES, np.float32)
     zero, one = np.int64(0), np.int64(1)
     seen, in_pairs = features.ravel(), inputs[: len(inputs) // 2 * 2].view(np.int32)
-    found_all, step = seen.view(np.int16), features.shape[1]
-    _encode(encodings[0], places, 0, start, stop - start, found_all, step, 0, corner_scratch)
-    rest = len(encodings[0][1])
-    _encode(encodings[1], places, RESTING, start, stop - start, found_all, step, rest,
-            corner_scratch)  # fmt: skip
+    halves, step = seen.view(np.int16), features.shape[1]
+    steps, rest = (2 * step, np.int64(2), one), 2 * step * len(encodings[0][1])
+    encode(encodings[0], places, 0, start, stop - start, halves, zero, steps, corner_scratch)
+    encode(encodings[1], places, RESTING, start, stop - start, halves, rest, steps, corner_scratch)
     for begin in range(start, stop, BLOCK):
         n = min(BLOCK, stop - begin)
         through_layers(zero, n, seen, begin - start, one, step, density, no_rows,
@@ -174,7 +155,7 @@ def shade(count, base, views, field, inputs, shown, shown_row, shown_weight, roo
     half = columns_of(field) // 2
     wide = colour[0][-1, OUT_PAD]
     zero, one = np.int64(0), np.int64(1)
-    group = views[base:]
+    group = views[base:].reshape(-1)
     source = inputs[: len(inputs) // 2 * 2].view(np.int32)
     for begin in range(0, count, BLOCK):
         n = min(BLOCK, count - begin)

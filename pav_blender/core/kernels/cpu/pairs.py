@@ -16,6 +16,7 @@ from numba import njit, types
 from numba.extending import intrinsic
 
 from ..structures import Layers
+from .lanes import load, store
 from .mlp import BLOCK
 from .search import INLINE, LEAN
 from .tiles import LANES, ROWS, SHAPES, Tile
@@ -229,8 +230,8 @@ def workspace(plan):
 
 @njit(**LEAN)
 def through_layers(begin, count, x, x_at, x_step, x_stride, network, bias_rows, group, work):
-    """As `mlp.through_layers` for `count` samples, inputs x in pairs; results in work[2], row by
-    row as wide as the last layer's padding."""
+    """As `mlp.through_layers` for `count` samples, inputs x in pairs, bias_rows flat, in rows as
+    wide as the first layer's padding; results in work[2], row by row as wide as the last's."""
     plan, weights, biases = network
     hidden, pairs, sums = work
     zero, one = np.int64(0), np.int64(1)
@@ -241,9 +242,10 @@ def through_layers(begin, count, x, x_at, x_step, x_stride, network, bias_rows, 
         init, init_at, init_step = biases, row[BIAS], zero
         if layer == 0 and len(bias_rows) > 0:
             for i in range(count):
-                extra = bias_rows[group[begin + i]]
-                for k in range(len(extra)):
-                    sums[i * wide + k] = biases[row[BIAS] + k] + extra[k]
+                extra = group[begin + i] * wide
+                for k in range(0, wide, LANES):
+                    more = load(bias_rows, extra + k)
+                    store(sums, i * wide + k, load(biases, row[BIAS] + k) + more)
             init, init_at, init_step = sums, zero, wide
         if layer == len(plan) - 1:
             _multiply(count, row[OUT], row[IN], sums, zero, wide, init, init_at, init_step,

@@ -74,19 +74,24 @@ def pick(
 
 
 @njit(**LEAN)
-def _until(x, d, cell, clear):
-    """How far along the ray x leaves the cells that are nearer than `clear` to this one."""
-    if d > 0:
-        return (np.float32(cell + clear) - x) / d
-    if d < 0:
-        return (np.float32(cell + 1 - clear) - x) / d
-    return np.float32(np.inf)
+def _until(x, inverse, cell, clear):
+    """How far along the ray, one over its direction being `inverse`, x leaves the cells that are
+    nearer than `clear` to this one."""
+    if inverse > 0:
+        return (np.float32(cell + clear) - x) * inverse
+    return (np.float32(cell + 1 - clear) - x) * inverse
+
+
+@njit(**LEAN)
+def inverse(d):
+    """One over a direction; infinite, and above zero, where it does not move."""
+    return np.float32(1) / d if d != 0 else np.float32(np.inf)
 
 
 @njit(**LEAN)
 def visit(x, y, z, dx, dy, dz, bricks, brick_count):
     """The flat voxel of a place (x, y, z), in bricks, or -1 where there is none; and how far along
-    the direction (dx, dy, dz) there will be none either."""
+    a direction, one over which is (dx, dy, dz), there will be none either."""
     nothing = np.float32(0)
     if not (min(x, y, z) >= 0 and max(x, y, z) < np.float32(brick_count)):
         return np.int64(-1), nothing
@@ -110,13 +115,14 @@ def _choose(ray, first, last, origins, directions, jitter, step, bricks, brick_c
     oy = (origins[ray, 1] - corner[1]) * scale
     oz = (origins[ray, 2] - corner[2]) * scale
     dx, dy, dz = directions[ray, 0] * scale, directions[ray, 1] * scale, directions[ray, 2] * scale
+    over = inverse(dx), inverse(dy), inverse(dz)
     count, looks, length, begin = 0, 0, 0, 0
     added, passed = np.float32(0.0), np.float32(0.0)
     k = first
     while k <= last:
         t = (np.float32(k) + jitter) * step
         k += 1
-        voxel, clear = visit(ox + t * dx, oy + t * dy, oz + t * dz, dx, dy, dz, bricks, brick_count)
+        voxel, clear = visit(ox + t * dx, oy + t * dy, oz + t * dz, *over, bricks, brick_count)
         cell = cells[voxel] if voxel >= 0 else -1
         if cell < 0:
             k += max(np.int64(min(clear / step, np.float32(last - k))), 0)

@@ -19,7 +19,7 @@ from .fields import arrays_of, densities, features_for, inputs_for, shade, shadi
 from .frozen import DISTANCE, PLACES, RESTING, ROOM, WEIGHTS
 from .lanes import LANES, fma, load, maximum, minimum, splat, splat_int, store
 from .marching import clear_cells, flat, locate, rows_of, walk
-from .picking import visit
+from .picking import inverse, visit
 from .search import LEAN, OPTIONS, STACK
 from .threads import run_chunks
 
@@ -88,7 +88,7 @@ def trace(
         walked,
         space,
         (*unit, rows_of(still, np.float32)),
-        rows_of(views, np.float32),
+        _padded(views),
         field,
         (
             probing.width,
@@ -102,6 +102,11 @@ def trace(
         tuple(values.numpy() for values in traced[:3]),
     )
     return traced._replace(evaluations=evaluations)
+
+
+def _padded(rows: torch.Tensor) -> np.ndarray:
+    """Rows [R, N] with zeros to the next whole vector."""
+    return rows_of(torch.nn.functional.pad(rows, (0, -rows.shape[1] % LANES)), np.float32)
 
 
 @njit(**LEAN)
@@ -119,12 +124,13 @@ def _runs(ray, first, last, rays, space, left, lengths_of, begins,
     oy = (origins[ray, 1] - corner[1]) * scale
     oz = (origins[ray, 2] - corner[2]) * scale
     dx, dy, dz = directions[ray, 0] * scale, directions[ray, 1] * scale, directions[ray, 2] * scale
+    over = inverse(dx), inverse(dy), inverse(dz)
     count, length, added = -1, 0, np.float32(0.0)
     k = first
     while k <= last:
         t = (np.float32(k) + np.float32(0.5)) * step
         k += 1
-        voxel, clear = visit(ox + t * dx, oy + t * dy, oz + t * dz, dx, dy, dz, bricks, brick_count)
+        voxel, clear = visit(ox + t * dx, oy + t * dy, oz + t * dz, *over, bricks, brick_count)
         density = thin[voxel] if voxel >= 0 else np.float32(-1)
         if density < 0:
             k += max(np.int64(min(clear / step, np.float32(last - k))), 0)
