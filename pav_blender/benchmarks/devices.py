@@ -41,7 +41,7 @@ def run(options: Options, progress: Report | None = None) -> tuple[dict[str, Any
             show_it = partial(
                 render, avatar, frame.vertices, camera, name, expression=frame.expression
             )
-            every = show_it(settings=RenderSettings(probe=1, longest=1))
+            every = show_it(settings=RenderSettings(probe=1, longest=1, agreement=0.0, brief=False))
             pictures[where] = over(every.rgba, 1.0)
             row[f"picture_{'cpu' if where == 'cpu' else 'device'}"] = round(
                 best({"picture": show_it}, options.repeats)["picture"], 3

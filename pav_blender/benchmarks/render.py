@@ -41,6 +41,7 @@ SKIPS = {
     "runs and thin places taken together": {"probe": 1, "longest": 1},
     "opaque rays": {"transmittance": 0.0},
     "colours that hardly show": {"negligible": 0.0},
+    "pixels between four that agree": {"agreement": 0.0},
 }
 
 
@@ -118,6 +119,9 @@ def _variants(size: int) -> dict[str, RenderSettings]:
         found[f"share {share:g}"] = change(_FINAL, share=share)
     for tolerance in (0.05, 0.1, 0.4):
         found[f"tolerance {tolerance:g}"] = change(_FINAL, tolerance=tolerance)
+    for agreement in (0.0, 0.03, 0.1):
+        found[f"agreement {agreement:g}"] = change(_FINAL, agreement=agreement)
+    found["networks in float32"] = change(_FINAL, brief=False)
     for probe in (1, 2, 4):
         found[f"runs of {probe}"] = change(_FINAL, probe=probe)
     return found

@@ -44,13 +44,20 @@ def test_depth_is_where_the_tracked_face_is(toy, toy_avatar, pose):
 
 
 def test_a_region_is_that_part_of_the_whole(toy_avatar, pose):
-    whole = picture(toy_avatar, pose)
-    part = picture(toy_avatar, pose, region=(10, 5, 50, 45))
+    box = (10, 5, 50, 45)
+    every = RenderSettings(agreement=0.0)
+    whole = picture(toy_avatar, pose, settings=every)
+    part = picture(toy_avatar, pose, region=box, settings=every)
     np.testing.assert_allclose(part.rgba, whole.rgba[5:45, 10:50], atol=1e-5)
     np.testing.assert_allclose(part.depth, whole.depth[5:45, 10:50], rtol=1e-5)
+    # which pixels are the mean of others depends on where a picture begins
+    spared = picture(toy_avatar, pose, region=box)
+    difference = over(spared.rgba, 1.0) - over(whole.rgba[5:45, 10:50], 1.0)
+    assert 0 < np.abs(difference).max() < RenderSettings().agreement
 
 
-EVERY = RenderSettings(probe=1, longest=1)  # looks at every place that is in some voxel
+# looks at every place that is in some voxel
+EVERY = RenderSettings(probe=1, longest=1, agreement=0.0, brief=False)
 
 
 def test_skipping_empty_space_changes_next_to_nothing(toy_avatar, pose):
@@ -107,7 +114,9 @@ def test_waves_and_chunks_do_not_show(toy_avatar, pose):
     # where a wave ends, places that would go together are parted
     waves = picture(toy_avatar, pose, settings=RenderSettings(wave=8))
     assert psnr(over(usual.rgba, 1.0), over(waves.rgba, 1.0)) > 46
-    alone = [picture(toy_avatar, pose, settings=dataclasses.replace(EVERY, wave=w)) for w in (3, 9)]
+    # a ray ends where a wave does: with little left of it, it does not matter where
+    far = dataclasses.replace(EVERY, transmittance=1e-3)
+    alone = [picture(toy_avatar, pose, settings=dataclasses.replace(far, wave=w)) for w in (3, 9)]
     assert np.abs(over(alone[0].rgba, 1.0) - over(alone[1].rgba, 1.0)).max() < 2e-3
 
 
@@ -373,11 +382,13 @@ def test_settings_that_cannot_be_are_told(change):
 
 @pytest.mark.parametrize("size", [(1, 1), (3, 5), (4, 4), (17, 9), (64, 64), (5, 1)])
 def test_tiles_hold_every_pixel_once_and_neighbours_together(size):
-    from pav_blender.core.rendering.rays import TILE, tiled
+    from pav_blender.core.rendering.rays import tiled
 
     width, height = size
     order = tiled(width, height)
     assert sorted(order.tolist()) == list(range(width * height))
     row, column = np.divmod(order, width)
-    tile = row // TILE * -(-width // TILE) + column // TILE
-    assert (np.diff(tile) >= 0).all()
+    for start in range(0, len(order), 16):  # a packet
+        part = slice(start, start + 16)
+        spread = np.ptp(row[part]) + np.ptp(column[part])
+        assert spread <= 6 or min(size) < 4 or max(size) % 4

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,12 +13,14 @@ from pav_blender.core.config import Config
 from pav_blender.core.evaluation.metrics import over, psnr
 from pav_blender.core.field.field import condition
 from pav_blender.core.field.frozen import freeze
+from pav_blender.core.kernels.cpu import frozen_pairs, pairs
+from pav_blender.core.kernels.structures import Layers
 from pav_blender.core.rendering import render as rendering
 from pav_blender.core.rendering.render import RenderSettings, render
 from pav_blender.core.training.frames import camera_of
 from pav_blender.core.training.prepare import load_training_frames, new_avatar
 
-EVERY = RenderSettings(probe=1, longest=1)
+EVERY = RenderSettings(probe=1, longest=1, agreement=0.0, brief=False)
 SMALL = Config(levels=6, log2_entries=12, finest_resolution=128, occupancy_resolution=48)
 FIELDS = {
     "default": {},
@@ -68,12 +71,15 @@ def test_every_kind_of_field_looks_the_same(toy, frames, pose, name, worn, monke
     upper = (height > np.median(height)) * np.float32(0.7)
     blend = {"plain": 1 - upper, "bushy": upper} if worn == "several" else "plain"
     whole = render(avatar, appearance=blend, settings=EVERY, **pose)
+    brief = render(avatar, appearance=blend, settings=replace(EVERY, brief=True), **pose)
     monkeypatch.setattr(rendering, "_whole", rendering._by_waves)
     steps = render(avatar, appearance=blend, settings=EVERY, **pose)
     assert (steps.rgba[..., 3] > 0.5).mean() > 0.05
     assert steps.rgba[..., :3][steps.rgba[..., 3] > 0.5].std() > 0.01
     assert psnr(over(whole.rgba, 1.0), over(steps.rgba, 1.0)) > 75
     assert whole.evaluations == pytest.approx(steps.evaluations, rel=1e-3)
+    assert psnr(over(brief.rgba, 1.0), over(whole.rgba, 1.0)) > 55
+    assert pairs.available() != np.array_equal(brief.rgba, whole.rgba)
 
 
 def test_evaluations_are_those_of_the_field(toy_avatar, pose, monkeypatch):
@@ -118,3 +124,53 @@ def test_a_frozen_field_is_the_field(toy, frames, name):
         own = own + field.offset.group_weight @ seen
         folded = torch.cat([rows, geometry], 1) @ frozen.offset.weights[0].T
         torch.testing.assert_close(folded + frozen.offset.biases[0], own)
+
+
+@pytest.mark.parametrize("sizes", [(5, 16, 3), (36, 64, 16), (8, 1), (7, 33, 50, 17)])
+def test_networks_in_bfloat16_are_those_of_rounded_numbers(sizes):
+    """Against float64 sums of numbers rounded as the kernel says it rounds them."""
+    if not pairs.available():
+        pytest.skip("this processor does not multiply pairs of bfloat16 numbers")
+    rng = np.random.default_rng(0)
+    shapes = list(zip(sizes[1:], sizes[:-1], strict=True))
+    layers = Layers(
+        [torch.tensor(rng.normal(size=s), dtype=torch.float32) for s in shapes],
+        [torch.tensor(rng.normal(size=s[0]), dtype=torch.float32) for s in shapes],
+    )
+    network, count = pairs.pack(layers), 23
+    x = rng.normal(size=(count + pairs.BLOCK, sizes[0] + sizes[0] % 2)).astype(np.float32)
+    x[:, sizes[0] :] = 0
+    found = through(network, pairs.rounded(x).view(np.int32), count)[:, : sizes[-1]]
+
+    def short(values):
+        bits = pairs.rounded(values).view(np.uint16).astype(np.uint32) << 16
+        return bits.view(np.float32).astype(np.float64)
+
+    hidden = short(x[:count, : sizes[0]])
+    for k, (weight, bias) in enumerate(zip(layers.weights, layers.biases, strict=True)):
+        hidden = hidden @ short(weight.numpy()).T + bias.double().numpy()
+        if k < len(layers.weights) - 1:
+            hidden = short(np.maximum(hidden, 0).astype(np.float32))
+    # a sum on the edge of two bfloat16 numbers may be rounded to the other
+    scale = np.abs(hidden).max()
+    assert np.abs(found - hidden).max() < 1e-2 * scale
+    assert np.median(np.abs(found - hidden)) < 1e-4 * scale
+
+
+def through(network, x, count):
+    """A network's answers [count, padded]."""
+    work = pairs.workspace(network.plan)
+    none = np.zeros(0, np.float32), np.zeros(0, np.int32)
+    at, step, stride = (np.int64(n) for n in (0, x.shape[1], 1))
+    pairs.through_layers(at, np.int64(count), x.reshape(-1), at, step, stride, network, *none, work)
+    wide = network.plan[-1, pairs.OUT_PAD]
+    return work[2][: count * wide].reshape(count, wide)
+
+
+def test_numbers_beyond_bfloat16_stay_in_float32(toy, frames, pose):
+    avatar = stirred(toy, frames, {})
+    with torch.no_grad():
+        avatar.field.colour.weights[0][0, 0] = 3e38
+    still = np.zeros(len(avatar.expression_names), np.float32), np.zeros(3, np.float32)
+    field = freeze(avatar.field, condition(avatar.config, *still), avatar.field.wearing([0]))
+    assert not frozen_pairs.fits(field)

@@ -42,19 +42,22 @@ class Bound:
 
 # A ray that ends with T left is taken as opaque: what lay behind has a colour in [0, 1] and T of
 # the weight, and so has what is shown in its place: off by at most T.
-# Colours below a weight of 0.5 a metre are left out: over at most 0.4 m of ray 0.2 of its weight.
+# Colours below a weight of 1 a metre are left out: over at most 0.4 m of ray 0.4 of its weight.
 # A voxel is left out where no filled cell can be: nothing but what the affine map in a brick errs.
 # PNG: half a step of colour and half one of alpha. EXR: halves have 11 bits, and sRGB's slope over
 # its value is at most 1 of the linear's: 2^-11, and as much for alpha.
 BOUNDS = {
-    "rays end at transmittance 0.005": Bound(None, 5e-3, "what is left"),
+    "rays end at transmittance 0.01": Bound(None, 1e-2, "what is left"),
     "rays end at 0.02 (preview)": Bound(None, 2e-2, "what is left"),
-    "no colour below 0.5 a metre": Bound(60, 0.2, "weight left out"),
-    "no colour below 1 a metre (preview)": Bound(55, 0.4, "weight left out"),
+    "no colour below 1 a metre": Bound(55, 0.4, "weight left out"),
+    "no colour below 2 a metre (preview)": Bound(50, 0.8, "weight left out"),
     "voxels": Bound(65, None, "only what is empty"),
     "thin places together": Bound(50, None, "goes by a guide"),
     "runs of 3, taken apart from 0.2": Bound(50, None, "goes by a guide"),
     "runs of 2, from 0.4 (preview)": Bound(50, None, "goes by a guide"),
+    "pixels between those that agree to 0.06": Bound(50, None, "as their neighbours are"),
+    "to 0.1 (preview)": Bound(45, None, "as their neighbours are"),
+    "networks in bfloat16": Bound(55, None, "8 bits of each number"),
     "all of final": Bound(50, None, "docs/performance.md"),
     "all of preview, its step of 2.5 mm too": Bound(40, None, "docs/performance.md"),
     "float32 for float64": Bound(70, 1e-3, "rounding"),
@@ -75,14 +78,17 @@ def _changed(base: RenderSettings, like: RenderSettings, *names: str) -> RenderS
 
 # what is switched on: settings with it, settings without
 _SWITCHES = {
-    "rays end at transmittance 0.005": (_changed(_DENSE, _FINAL, "transmittance"), _DENSE),
+    "rays end at transmittance 0.01": (_changed(_DENSE, _FINAL, "transmittance"), _DENSE),
     "rays end at 0.02 (preview)": (_changed(_DENSE, _PREVIEW, "transmittance"), _DENSE),
-    "no colour below 0.5 a metre": (_changed(_DENSE, _FINAL, "negligible"), _DENSE),
-    "no colour below 1 a metre (preview)": (_changed(_DENSE, _PREVIEW, "negligible"), _DENSE),
+    "no colour below 1 a metre": (_changed(_DENSE, _FINAL, "negligible"), _DENSE),
+    "no colour below 2 a metre (preview)": (_changed(_DENSE, _PREVIEW, "negligible"), _DENSE),
     "voxels": (_VOXELS, _DENSE),
     "thin places together": (_changed(_VOXELS, _FINAL, "share", "longest"), _VOXELS),
     "runs of 3, taken apart from 0.2": (_changed(_VOXELS, _FINAL, "probe", "tolerance"), _VOXELS),
     "runs of 2, from 0.4 (preview)": (_changed(_VOXELS, _PREVIEW, "probe", "tolerance"), _VOXELS),
+    "pixels between those that agree to 0.06": (_changed(_VOXELS, _FINAL, "agreement"), _VOXELS),
+    "to 0.1 (preview)": (_changed(_VOXELS, _PREVIEW, "agreement"), _VOXELS),
+    "networks in bfloat16": (_changed(_VOXELS, _FINAL, "brief"), _VOXELS),
     "all of final": (_FINAL, _DENSE),
     "all of preview, its step of 2.5 mm too": (_PREVIEW, _DENSE),
 }

@@ -28,7 +28,7 @@ _ASYMPTOTIC = 2.0  # millimetres: coarser steps pass hair and lips without a loo
 
 def every(step: float) -> RenderSettings:
     """A picture with a sample every `step` metres, none skipped."""
-    return RenderSettings(step=step, transmittance=0.0, skip=False, negligible=0.0, wave=64)
+    return dataclasses.replace(RenderSettings.preset("reference"), step=step)
 
 
 def settings_of() -> dict[str, tuple[str, RenderSettings]]:

@@ -18,8 +18,8 @@ from .subjects import Head
 
 COARSE = 4e-3  # metres between places where the oracle looks as well
 # every place looked at, nothing passed over, no ray ended
-WHOLE = RenderSettings(step=COARSE, skip=False, transmittance=0.0, negligible=0.0, wave=64)
-EVERY = RenderSettings(step=COARSE, probe=1, longest=1, transmittance=0.0, negligible=0.0)
+WHOLE = replace(RenderSettings.preset("reference"), step=COARSE)
+EVERY = replace(WHOLE, skip=True, probe=1, longest=1, wave=RenderSettings().wave)
 LEVELS = 255.0
 _PIXELS = 6  # that the oracle looks at
 _POINTS = 300

@@ -53,14 +53,14 @@ class RenderSettings:
     """
 
     step: float = 1e-3
-    transmittance: float = 5e-3
+    transmittance: float = 1e-2
     skip: bool = True
     share: float = 0.02
     longest: int = 4
     probe: int = 3
     tolerance: float = 0.2
-    negligible: float = 0.5
-    agreement: float = 0.05
+    negligible: float = 1.0
+    agreement: float = 0.06
     brief: bool = True
     wave: int = 3
     chunk: int = 1 << 13
@@ -86,7 +86,7 @@ class RenderSettings:
                 tolerance=0.4,
                 share=0.05,
                 transmittance=2e-2,
-                negligible=1.0,
+                negligible=2.0,
                 agreement=0.1,
             ),
             "final": cls(),
