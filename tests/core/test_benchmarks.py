@@ -35,7 +35,8 @@ def test_the_reference_preset_is_what_plain_torch_gives(toy, toy_avatar):
 
 def test_every_skip_costs_less_than_it_hides(toy, toy_avatar):
     frame = a_frame(toy)
-    truth = _picture(toy_avatar, frame, 64, RenderSettings(skip=False, transmittance=0.0, agreement=0.0))
+    dense = RenderSettings(skip=False, transmittance=0.0, agreement=0.0)
+    truth = _picture(toy_avatar, frame, 64, dense)
     rows = _skips(toy_avatar, frame, 64, truth, 1)
     assert len(rows) == len(SKIPS) + 1
     final, *without = rows

@@ -39,10 +39,11 @@ def test_a_device_that_is_not_here_is_told(name):
 
 
 @pytest.mark.parametrize(
-    "settings", [
+    "settings",
+    [
         RenderSettings(probe=1, longest=1, agreement=0.0, brief=False),
         RenderSettings(skip=False, agreement=0.0),
-    ]
+    ],
 )
 def test_a_picture_is_the_same_on_every_device(toy, toy_avatar, device, settings):
     clip = toy.clip("plain")

@@ -55,7 +55,7 @@ def test_compiled_fill_is_the_reference(corner, limited, size):
     for plain, compiled in zip(results[0][1:], results[1][1:], strict=True):
         np.testing.assert_allclose(compiled, plain, rtol=1e-5, atol=1e-6)
     if size == (33, 40) and not limited:
-        assert results[0][0].any() and not results[0][0].all()
+        assert 0 < results[0][0].mean() < 1
 
 
 @pytest.mark.parametrize("size", [(1, 1), (2, 9), (3, 3), (48, 31), (64, 64)])

@@ -208,7 +208,8 @@ def steps(given: Given) -> Found:
     """Places from a hundredth of a millimetre to ten centimetres apart."""
     head, found = given.head, Found()
     camera = head.camera.resized(16, 16)
-    finest = shown(head, RenderSettings(step=1e-4, probe=1, longest=1, agreement=0.0, brief=False), camera)
+    exact = RenderSettings(step=1e-4, probe=1, longest=1, agreement=0.0, brief=False)
+    finest = shown(head, exact, camera)
     for step in (1e-5, 1e-4, 1e-3, 1e-2, 1e-1):
         settings = RenderSettings(step=step)
         picture = shown(head, settings, camera)

@@ -1,7 +1,8 @@
 """Two implementations of one interface: `reference` (plain torch, any device) and `cpu` (numba).
 
 Both folders hold the same file names (nearest, encoding, mlp, marching, picking, optimiser,
-solids, sparing) with the same functions. Code that computes asks for one of them and never names it:
+solids, sparing) with the same functions. Code that computes asks for one of them and never names
+it:
 
 >>> from pav_blender.core.kernels import select
 >>> kernels = select("cpu")

@@ -12,9 +12,9 @@ import numpy as np
 import torch
 
 from .. import kernels
+from ..cores import threads
 from ..deformation import Clearance, PosedMesh, Thrift, Voxels, voxels
 from ..deformation.rigid import Stance, stance
-from ..cores import threads
 from ..errors import Cancelled, InputError
 from ..field.avatar import Avatar
 from ..field.directions import spherical_harmonics
@@ -261,7 +261,7 @@ def render_scene(
     limits = None if limit is None else np.asarray(limit, np.float32).reshape(-1)
     with torch.inference_mode(), torch_alone():
         if _compiled(scene, settings):
-            scene.known, _field(scene, settings)  # noqa: B018  once, not by every thread
+            scene.known, _field(scene, settings)
         order = tiled(camera.width, camera.height)
         count = len(order)
         rgba = np.zeros((count, 4), np.float32)

@@ -15,6 +15,7 @@ from numba import njit, types
 from numba.extending import intrinsic
 
 from ..reference.encoding import PRIMES
+from .search import LEAN
 from .tiles import LANES
 from .writer import FLOAT, INT, LONG, Writer
 
@@ -193,9 +194,7 @@ def read_edges(typing, table, index, weight, i, out, first, second):
             entry = builder.shl(builder.zext(writer.load(indices, here, INT), LONG), LONG(1))
             total = writer.total(total, writer.product(share, writer.load(entries, entry, ends)))
         low, high = (
-            builder.shuffle_vector(
-                total, total, ir.Constant(ir.VectorType(INT, 2), [end, end + 1])
-            )
+            builder.shuffle_vector(total, total, ir.Constant(ir.VectorType(INT, 2), [end, end + 1]))
             for end in (0, 2)
         )
         along = writer.load(weights, builder.add(at, LONG(4 * STRIDE)), FLOAT)
@@ -239,7 +238,7 @@ def _fetch_corners(typing, table, index, i):
     return types.void(table, index, i), generate
 
 
-@njit(nogil=True, _nrt=False)
+@njit(**LEAN)
 def locate_block(unit, count, res, first, mask, table, index, weight):
     """Corners of the `count` points in unit [3 * BLOCK] on one level, and the first ones fetched.
 
@@ -256,7 +255,7 @@ def locate_block(unit, count, res, first, mask, table, index, weight):
         _fetch_corners(table, index, i)
 
 
-@njit(nogil=True, _nrt=False)
+@njit(**LEAN)
 def locate_edges(unit, count, res, first, index, weight):
     """Edges along x round the `count` points in unit [3 * BLOCK] on a dense level, for
     `read_edges`; index [4 * STRIDE] and weight [5 * STRIDE] receive them."""

@@ -12,6 +12,8 @@ from ..structures import Frozen
 from . import frozen, frozen_pairs
 from .search import INLINE
 
+_OPTIONS: Any = INLINE
+
 
 def arrays_of(field: Frozen, brief: bool = True) -> tuple[Any, ...]:
     """What compiled functions are told of a field: encodings, density and offset, colour, latent,
@@ -43,25 +45,25 @@ def densities(start, stop, field, mesh_corners, samples, features, inputs, sigma
 def shade(count, base, views, field, inputs, shown, shown_row, shown_weight, room, out): ...
 
 
-@overload(features_for, jit_options=INLINE)
+@overload(features_for, jit_options=_OPTIONS)
 def _features_for(field, most):
     chosen = _of(field).features_for
     return lambda field, most: chosen(field, most)
 
 
-@overload(inputs_for, jit_options=INLINE)
+@overload(inputs_for, jit_options=_OPTIONS)
 def _inputs_for(field, count):
     chosen = _of(field).inputs_for
     return lambda field, count: chosen(field, count)
 
 
-@overload(shading_room, jit_options=INLINE)
+@overload(shading_room, jit_options=_OPTIONS)
 def _shading_room(field):
     chosen = _of(field).shading_room
     return lambda field: chosen(field)
 
 
-@overload(densities, jit_options=INLINE)
+@overload(densities, jit_options=_OPTIONS)
 def _densities(start, stop, field, mesh_corners, samples, features, inputs, sigma, parts):
     chosen = _of(field).densities
 
@@ -71,7 +73,7 @@ def _densities(start, stop, field, mesh_corners, samples, features, inputs, sigm
     return run
 
 
-@overload(shade, jit_options=INLINE)
+@overload(shade, jit_options=_OPTIONS)
 def _shade(count, base, views, field, inputs, shown, shown_row, shown_weight, room, out):
     chosen = _of(field).shade
 

@@ -144,8 +144,8 @@ def encode(encoding, places, axes, start, count, features, at, steps, scratch):
 
 
 @njit(**LEAN)
-def embedding_rows(surface, first, mesh_corners, triangle, places, begin, count, index, weight, out, row,
-           step):  # fmt: skip
+def embedding_rows(surface, first, mesh_corners, triangle, places, begin, count, index, weight,
+                   out, row, step):  # fmt: skip
     """An appearance's features, which are from `first` on, at samples from `begin` on, one row of
     out each from `row` on."""
     latent, width, side, uvs = surface
@@ -257,8 +257,8 @@ def densities(start, stop, field, mesh_corners, samples, features, inputs, sigma
                        plan, no_rows, no_group, density_work)  # fmt: skip
         for k in range(count):
             row = k * room + begin
-            embedding_rows(latent, k * of_one, mesh_corners, triangle, places, begin, n, index, weight,
-                   inputs, row, columns)  # fmt: skip
+            embedding_rows(latent, k * of_one, mesh_corners, triangle, places, begin, n, index,
+                           weight, inputs, row, columns)  # fmt: skip
             at, wide = plan[-1, HIDDEN], plan[-1, OUT_PAD]
             for i in range(n):
                 to = (row + i) * columns + embedding

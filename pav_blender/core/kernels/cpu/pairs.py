@@ -90,9 +90,7 @@ def pack(layers: Layers | None, order: np.ndarray | None = None) -> Network:
         plan.append((pairs, outs, pad, at, first, hidden))
         at, first, hidden = at + pairs * pad, first + pad, hidden + BLOCK * pad
         ins, order = outs, None
-    return Network(
-        np.array(plan, np.int64), np.concatenate(weights), np.concatenate(biases)
-    )
+    return Network(np.array(plan, np.int64), np.concatenate(weights), np.concatenate(biases))
 
 
 @intrinsic

@@ -160,7 +160,7 @@ def _filled_near(x, y, z, voxels, grid):
     at a table, which spares most of the searches that would find nothing."""
     bricks, brick_count, maps, corner, scale = voxels
     cells, size, grid_corner, grid_scale = grid
-    u = (np.int64((x - corner[0]) * scale) * brick_count + np.int64((y - corner[1]) * scale))
+    u = np.int64((x - corner[0]) * scale) * brick_count + np.int64((y - corner[1]) * scale)
     row = bricks[u * brick_count + np.int64((z - corner[2]) * scale)]
     if row < 0:
         return True

@@ -1,4 +1,4 @@
-"""Pixels that lie between four others and are their mean where those agree; see `cpu/sparing.py`."""
+"""Pixels that lie between four others and are their mean where those agree."""
 
 from __future__ import annotations
 
