@@ -26,7 +26,7 @@ from ..kernels.structures import Frozen, Picks, Probing, Traced, Wave
 from .cameras import Camera
 from .rays import RayBatch, camera_rays, pack, samples_of, tiled
 from .sparing import passes
-from .wearing import Appearance, Wearing, deformer_of, wearing_of
+from .wearing import Appearance, Wearing, deformer_of, short_tables_of, wearing_of
 
 _LEAST_CHUNK, _SHARES = 1 << 10, 4  # rays a thread takes at a time; times it should
 _FAR_WAVE = 24  # samples a ray between two looks, where every look waits for a device
@@ -48,8 +48,9 @@ class RenderSettings:
     density there (`guide`), and at those beside it only where that adds more than `tolerance`;
     negligible: weight a metre below which a sample's colour is not asked for; agreement: a pixel
     between four that differ by less is their mean (`sparing`; 0: every pixel is traced); brief:
-    networks in bfloat16 where the processor multiplies it; wave: samples a ray between two looks at
-    its transmittance; chunk: rays that a thread takes at a time.
+    tables and networks in bfloat16 where the processor multiplies it (for an avatar that changes no
+    more); wave: samples a ray between two looks at its transmittance; chunk: rays that a thread
+    takes at a time.
     """
 
     step: float = 1e-3
@@ -146,12 +147,13 @@ class Scene:
     @cached_property
     def packed(self) -> tuple[Any, ...]:
         """The same as compiled functions take it, in bfloat16 where the processor allows."""
-        return kernels.select("cpu").tracing.arrays_of(self.frozen)
+        tracing = kernels.select("cpu").tracing
+        return tracing.arrays_of(self.frozen, short_tables_of(self.avatar, self.frozen))
 
     @cached_property
     def packed_exactly(self) -> tuple[Any, ...]:
         """The same in float32."""
-        return kernels.select("cpu").tracing.arrays_of(self.frozen, brief=False)
+        return kernels.select("cpu").tracing.arrays_of(self.frozen)
 
 
 def pose_scene(

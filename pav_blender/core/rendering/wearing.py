@@ -12,12 +12,14 @@ import numpy as np
 import torch
 from scipy import ndimage
 
+from .. import kernels
 from ..deformation import Clearance, Deformer, clearance
 from ..errors import InputError
 from ..field.avatar import Avatar
 from ..field.field import Worn
 from ..field.identities import check_one_person, code
 from ..field.mixture import Mixture
+from ..kernels.structures import Frozen
 from .guide import guide, neighbourhood
 
 Appearance = str | Mapping[str, float | np.ndarray]
@@ -51,6 +53,16 @@ _places: weakref.WeakKeyDictionary[
 _mixed: weakref.WeakKeyDictionary[Avatar, OrderedDict[tuple[tuple[int, ...], bytes], Wearing]] = (
     weakref.WeakKeyDictionary()
 )
+_shorts: weakref.WeakKeyDictionary[Avatar, tuple[np.ndarray, np.ndarray] | None] = (
+    weakref.WeakKeyDictionary()
+)
+
+
+def short_tables_of(avatar: Avatar, frozen: Frozen) -> tuple[np.ndarray, np.ndarray] | None:
+    """An avatar's encodings in bfloat16, if this processor is to work with it; made once."""
+    if avatar not in _shorts:
+        _shorts[avatar] = kernels.select("cpu").tracing.short_tables(frozen)
+    return _shorts[avatar]
 
 
 def wearing_of(avatar: Avatar, appearance: Appearance) -> Wearing:

@@ -28,11 +28,23 @@ _INTS = ir.VectorType(INT, LANES)
 _PAIR = ir.VectorType(FLOAT, 2)
 
 
-def _entry(writer: Writer, index: Any, i: Any, corner: int) -> Any:
-    """Place in the table of the first feature at a corner of sample i."""
+def _entry(writer: Writer, table: Any, index: Any, i: Any, corner: int) -> Any:
+    """Place in the table of what a corner of sample i has: two float32 or, where the table is of
+    int32, two bfloat16."""
     builder = writer.builder
     at = builder.add(i, LONG(corner * STRIDE))
-    return builder.shl(builder.zext(writer.load(index, at, INT), LONG), LONG(1))
+    entry = builder.zext(writer.load(index, at, INT), LONG)
+    return entry if table.type.pointee == INT else builder.shl(entry, LONG(1))
+
+
+def _features(writer: Writer, table: Any, entry: Any, entries: int) -> Any:
+    """The features of entries that lie side by side, in float32."""
+    builder, kind = writer.builder, ir.VectorType(FLOAT, 2 * entries)
+    if table.type.pointee != INT:
+        return writer.load(table, entry, kind)
+    whole, short = (ir.VectorType(ir.IntType(bits), 2 * entries) for bits in (32, 16))
+    bits = builder.zext(writer.load(table, entry, short), whole)
+    return builder.bitcast(builder.shl(bits, ir.Constant(whole, [16] * 2 * entries)), kind)
 
 
 def _fetch(writer: Writer, table: Any, index: Any, i: Any) -> None:
@@ -40,7 +52,7 @@ def _fetch(writer: Writer, table: Any, index: Any, i: Any) -> None:
     neighbour in x mostly shares the cache line."""
     later = writer.builder.add(i, LONG(AHEAD))
     for corner in (0, 2, 4, 6):
-        writer.fetch(table, _entry(writer, index, later, corner))
+        writer.fetch(table, _entry(writer, table, index, later, corner))
 
 
 def _cells(writer: Writer, points: Any, at: Any, cells: Any) -> tuple[list[Any], ...]:
@@ -124,7 +136,7 @@ def _both(writer: Writer, entries: Any, indices: Any, weights: Any, at: Any) -> 
     for corner in range(8):
         here = writer.builder.add(at, LONG(corner * STRIDE))
         share = writer.splat(writer.load(weights, here, FLOAT), _PAIR)
-        pair = writer.load(entries, _entry(writer, indices, at, corner), _PAIR)
+        pair = _features(writer, entries, _entry(writer, entries, indices, at, corner), 1)
         half = corner & 1
         sums[half] = writer.total(sums[half], writer.product(share, pair))
     _fetch(writer, entries, indices, at)
@@ -191,8 +203,8 @@ def read_edges(typing, table, index, weight, i, out, first, second):
         for edge in range(4):
             here = builder.add(at, LONG(edge * STRIDE))
             share = writer.splat(writer.load(weights, here, FLOAT), ends)
-            entry = builder.shl(builder.zext(writer.load(indices, here, INT), LONG), LONG(1))
-            total = writer.total(total, writer.product(share, writer.load(entries, entry, ends)))
+            both = _features(writer, entries, _entry(writer, entries, indices, at, edge), 2)
+            total = writer.total(total, writer.product(share, both))
         low, high = (
             builder.shuffle_vector(total, total, ir.Constant(ir.VectorType(INT, 2), [end, end + 1]))
             for end in (0, 2)
@@ -220,7 +232,7 @@ def add_corners(typing, table, index, weight, i, source, first, second):
         for corner in range(8):
             here = builder.add(at, LONG(corner * STRIDE))
             share = writer.splat(writer.load(weights, here, FLOAT), _PAIR)
-            place = _entry(writer, indices, at, corner)
+            place = _entry(writer, entries, indices, at, corner)
             pair = writer.load(entries, place, _PAIR)
             writer.store(writer.total(pair, writer.product(share, slope)), entries, place)
         return context.get_dummy_value()

@@ -5,22 +5,27 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from numba import types
 from numba.extending import overload
 
 from ..structures import Frozen
 from . import frozen, frozen_pairs
+from .frozen_pairs import short_tables
 from .search import INLINE
+
+__all__ = ["arrays_of", "short_tables"]
 
 _OPTIONS: Any = INLINE
 
 
-def arrays_of(field: Frozen, brief: bool = True) -> tuple[Any, ...]:
+def arrays_of(field: Frozen, short: tuple[np.ndarray, np.ndarray] | None = None) -> tuple[Any, ...]:
     """What compiled functions are told of a field: encodings, density and offset, colour, latent,
-    the numbers of an untrained density, and how appearances mix. brief: with networks in bfloat16,
-    where this processor multiplies such."""
-    chosen = frozen_pairs if brief and frozen_pairs.fits(field) else frozen
-    return chosen.arrays_of(field)
+    the numbers of an untrained density, and how appearances mix. short: the encodings' tables as
+    `short_tables` made them, for all in bfloat16; else it is float32."""
+    if short is None or not frozen_pairs.fits(field):
+        return frozen.arrays_of(field)
+    return frozen_pairs.arrays_of(field, short)
 
 
 def _of(field: Any) -> Any:

@@ -1,7 +1,7 @@
 """`frozen` where the processor multiplies pairs of bfloat16 numbers (`pairs`): the same functions.
 
-What networks see of a sample is written in bfloat16: the embedding, then log-density and geometry,
-each from an even place on. Tables, log-densities and densities stay float32.
+Tables are in bfloat16, and what networks see of a sample: the embedding, then log-density and
+geometry, each from an even place on. Log-densities and densities stay float32.
 """
 
 from __future__ import annotations
@@ -35,18 +35,28 @@ from .tiles import LANES
 
 
 def fits(field: Frozen) -> bool:
-    """Whether this processor and a field's numbers allow for it."""
+    """Whether this processor and the numbers of a field's networks allow for it."""
     layers = (field.density, field.offset, field.colour)
     return pairs.available() and all(pairs.fit(network) for network in layers)
 
 
-def arrays_of(field: Frozen) -> tuple[Any, ...]:
-    """As `frozen.arrays_of`."""
+def short_tables(field: Frozen) -> tuple[np.ndarray, np.ndarray] | None:
+    """The tables of both encodings in bfloat16, the two features of an entry in an int32; None
+    where the processor or the numbers do not allow for it."""
+    found = [tables for tables, _ in field.encodings]
+    if not pairs.available() or not all(pairs.small(tables) for tables in found):
+        return None
+    short = [pairs.rounded(tables.detach().numpy()).reshape(-1).view(np.int32) for tables in found]
+    return short[0], short[1] if len(short) > 1 else np.zeros(0, np.int32)
+
+
+def arrays_of(field: Frozen, short: tuple[np.ndarray, np.ndarray]) -> tuple[Any, ...]:
+    """As `frozen.arrays_of`, with tables as `short_tables` makes them."""
     embedding, geometry = field.latent.shape[-1], len(field.density.biases[-1])
     seen = np.arange(embedding + geometry)
     seen[embedding:] += embedding % 2
     return (
-        encodings_of(field),
+        tuple((t, levels) for t, (_, levels) in zip(short, encodings_of(field), strict=True)),
         (
             pairs.pack(field.density),
             pairs.pack(field.offset, seen),

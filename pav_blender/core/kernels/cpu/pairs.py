@@ -11,6 +11,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from llvmlite import binding, ir
 from numba import njit, types
 from numba.extending import intrinsic
@@ -58,9 +59,12 @@ class Network(NamedTuple):
 
 def fit(layers: Layers | None) -> bool:
     """Whether all numbers of a network can be written in bfloat16 and summed."""
-    if layers is None:
-        return True
-    return all(float(x.abs().max()) < _LARGEST for x in (*layers.weights, *layers.biases))
+    return layers is None or all(small(x) for x in (*layers.weights, *layers.biases))
+
+
+def small(values: torch.Tensor) -> bool:
+    """Whether numbers are far from the largest that there are."""
+    return values.numel() == 0 or float(values.abs().max()) < _LARGEST
 
 
 def rounded(values: np.ndarray) -> np.ndarray:

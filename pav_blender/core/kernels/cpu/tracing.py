@@ -15,7 +15,15 @@ import torch
 from numba import njit
 
 from ..structures import Clearance, PosedMesh, Probing, Traced, Voxels
-from .fields import arrays_of, densities, features_for, inputs_for, shade, shading_room
+from .fields import (
+    arrays_of,
+    densities,
+    features_for,
+    inputs_for,
+    shade,
+    shading_room,
+    short_tables,
+)
 from .frozen import DISTANCE, PLACES, RESTING, ROOM, WEIGHTS
 from .lanes import LANES, fma, load, maximum, minimum, splat, splat_int, store
 from .marching import clear_cells, flat, locate, rows_of, walk
@@ -23,7 +31,7 @@ from .picking import inverse, visit
 from .search import LEAN, OPTIONS, STACK
 from .threads import run_chunks
 
-__all__ = ["arrays_of", "known_density", "trace"]
+__all__ = ["arrays_of", "known_density", "short_tables", "trace"]
 
 GROUP = 256  # rays that advance together
 _MAP = 16  # numbers of a brick's map
