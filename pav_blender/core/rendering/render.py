@@ -48,9 +48,8 @@ class RenderSettings:
     density there (`guide`), and at those beside it only where that adds more than `tolerance`;
     negligible: weight a metre below which a sample's colour is not asked for; agreement: a pixel
     between four that differ by less is their mean (`sparing`; 0: every pixel is traced); brief:
-    tables and networks in bfloat16 where the processor multiplies it (for an avatar that changes no
-    more); wave: samples a ray between two looks at its transmittance; chunk: rays that a thread
-    takes at a time.
+    tables and networks in bfloat16 where the processor multiplies it; wave: samples a ray between
+    two looks at its transmittance; chunk: rays that a thread takes at a time.
     """
 
     step: float = 1e-3
@@ -119,7 +118,8 @@ class Picture:
 @dataclass(eq=False)
 class Scene:
     """An avatar in a pose, wearing something: what all rays of a picture share. `origin` [3]
-    metres: where in the world the scene's own coordinates begin."""
+    metres: where in the world the scene's own coordinates begin; changing: nothing of the avatar is
+    kept for other scenes, since it is being trained."""
 
     avatar: Avatar
     mesh: PosedMesh
@@ -128,6 +128,7 @@ class Scene:
     condition: torch.Tensor
     wearing: Wearing
     origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    changing: bool = False
 
     @property
     def clearance(self) -> Clearance:
@@ -148,6 +149,8 @@ class Scene:
     def packed(self) -> tuple[Any, ...]:
         """The same as compiled functions take it, in bfloat16 where the processor allows."""
         tracing = kernels.select("cpu").tracing
+        if self.changing:
+            return tracing.arrays_of(self.frozen, tracing.short_tables(self.frozen))
         return tracing.arrays_of(self.frozen, short_tables_of(self.avatar, self.frozen))
 
     @cached_property

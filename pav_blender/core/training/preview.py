@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import math
 import time
-from dataclasses import replace
 from itertools import zip_longest
 from pathlib import Path
 
@@ -90,8 +89,7 @@ class Preview:
         camera = frame.camera.resized(SIDE, SIDE)
         columns, rows = np.meshgrid(np.arange(SIDE), np.arange(SIDE))
         rays = camera_rays(camera, columns.ravel(), rows.ravel())
-        # tables in bfloat16 are made once an avatar: these change under way
-        settings = replace(RenderSettings.preset("preview"), brief=False)
+        settings = RenderSettings.preset("preview")
         rgba, _ = trace_rays(self._trainer.scene(frame), rays, settings)
         return _on_grey(rgba.reshape(SIDE, SIDE, 4))
 

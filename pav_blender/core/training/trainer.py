@@ -212,7 +212,9 @@ class Trainer:
             person = self._codes[row]
             seen = condition(self.config, frame.expression, posed.stance.turn, person)
         wearing = Wearing(worn, None, space, self.visibility.guide[row], person)
-        return Scene(self.avatar, posed.mesh, posed.voxels, posed.stance, seen, wearing)
+        return Scene(
+            self.avatar, posed.mesh, posed.voxels, posed.stance, seen, wearing, changing=True
+        )
 
     def _choose_frames(self) -> list[Frame]:
         """Frames of a batch: appearances in turn, frames at random; small pictures come first."""
