@@ -207,17 +207,21 @@ def test_torn_bricks_as_the_reference_take_their_neighbours_cells():
     middles = where * 0.012 - 0.05
     canonical = torch.where(left[:, None], middles, middles + torch.tensor([0.0, 0.09, 0.0]))
     maps = torch.eye(3).repeat(512, 1, 1) + 0.01 * torch.randn((512, 3, 3), generator=generator)
-    filled = []
+    filled, leaps = [], []
     for kernels in (CPU, reference):
         cells = kernels.brick_cells(canonical, maps, ball(), 0.003)
         own = cells.clone()
-        kernels.add_torn(cells, at, where, canonical, maps, ball(), 0.003, 5)
+        leaps.append(kernels.add_torn(cells, at, where, canonical, maps, ball(), 0.003, 5))
         changed = (cells != own).any(1)
         assert (own[changed] < 0).any()
         assert torch.equal(cells[own >= 0], own[own >= 0])  # what was known stays
         assert set(where[changed][:, 0].tolist()) <= {4, 5}  # the seam alone
         filled.append(cells)
     assert (filled[0] == filled[1]).float().mean() > 0.999
+    torch.testing.assert_close(*leaps, rtol=0, atol=1e-6)
+    seam = (where[:, 0] == 4) | (where[:, 0] == 5)
+    assert leaps[0][seam].min() > 0.08
+    assert leaps[0][~seam].max() < 0.004
 
 
 def test_voxels_hide_little_where_a_turned_head_tears_space():

@@ -8,12 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from numba import njit
 
+from pav_blender.core import kernels
 from pav_blender.core.config import Config
 from pav_blender.core.evaluation.metrics import over, psnr
 from pav_blender.core.field.field import condition
 from pav_blender.core.field.frozen import freeze
-from pav_blender.core.kernels.cpu import frozen_pairs, pairs
+from pav_blender.core.kernels.cpu import frozen_pairs, marching, pairs, tracing
+from pav_blender.core.kernels.reference.marching import occupied
 from pav_blender.core.kernels.structures import Layers
 from pav_blender.core.rendering import render as rendering
 from pav_blender.core.rendering.render import RenderSettings, render
@@ -174,3 +177,34 @@ def test_numbers_beyond_bfloat16_stay_in_float32(toy, frames, pose):
     still = np.zeros(len(avatar.expression_names), np.float32), np.zeros(3, np.float32)
     field = freeze(avatar.field, condition(avatar.config, *still), avatar.field.wearing([0]))
     assert not frozen_pairs.fits(field)
+
+
+@njit
+def filled_near(points, voxels, grid):
+    found = np.zeros(len(points), np.bool_)
+    for i in range(len(points)):
+        found[i] = tracing._filled_near(points[i, 0], points[i, 1], points[i, 2], voxels, grid)
+    return found
+
+
+def test_bricks_spare_searches_and_hide_next_to_nothing(toy_avatar, pose):
+    scene = rendering.pose_scene(toy_avatar, pose["vertices"], "plain", pose["expression"])
+    voxels, space, ops = scene.voxels, scene.clearance, kernels.select("cpu")
+    rng = np.random.default_rng(0)
+    bricks = np.argwhere(voxels.bricks.numpy() >= 0)
+    inside = bricks[rng.integers(0, len(bricks), 20_000)] + rng.random((20_000, 3))
+    points = (inside / voxels.scale + voxels.box_min.numpy()).astype(np.float32)
+    flat = marching.flat
+    found = filled_near(
+        points,
+        (voxels.bricks.view(-1).numpy(), len(voxels.bricks), flat(voxels.maps),
+         flat(voxels.box_min), np.float32(voxels.scale)),
+        marching.grid_of(space),
+    )  # fmt: skip
+    where = torch.from_numpy(points)
+    triangle, barycentric, _ = ops.nearest.nearest(scene.mesh.search, where)
+    canonical = ops.marching.canonicalise(where, triangle, barycentric, scene.mesh)
+    filled = occupied(canonical, space).numpy()
+    assert 0.1 < filled.mean() < 0.9
+    assert (filled & ~found).sum() < 2e-3 * filled.sum()
+    assert (~found).sum() > 0.6 * (~filled).sum()
