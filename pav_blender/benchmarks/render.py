@@ -221,6 +221,7 @@ avatar, collection = Avatar.load(sys.argv[1]), read_collection(sys.argv[2])
 frame = chosen_frames(collection, ("test",), 1)[0]
 settings = RenderSettings.preset("preview")
 render(avatar, frame.vertices, frame.camera, avatar.appearances[0], settings)
+print("rendered", flush=True)
 """
 
 
@@ -233,10 +234,20 @@ def _cold_start(avatar: Path, cached: bool) -> float:
             environment["NUMBA_CACHE_DIR"] = empty
         command = [sys.executable, "-c", _FIRST_PICTURE, str(avatar), str(DEFAULT_COLLECTION)]
         started = time.perf_counter()
-        done = subprocess.run(command, env=environment, capture_output=True, text=True)
-        if done.returncode:
-            raise PavError(f"a first picture failed: {done.stderr.strip().splitlines()[-1]}")
-        return round(time.perf_counter() - started, 2)
+        with subprocess.Popen(
+            command,
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        ) as process:
+            assert process.stdout is not None
+            told = process.stdout.readline()
+            seconds = time.perf_counter() - started
+            _, errors = process.communicate()
+        if told != "rendered\n":
+            raise PavError(f"a first picture failed: {errors.strip().splitlines()[-1]}")
+        return round(seconds, 2)
 
 
 def _cycles(size: int) -> float:

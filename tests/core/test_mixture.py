@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from pav_blender.core.errors import InputError
 from pav_blender.core.evaluation.metrics import over, psnr
 from pav_blender.core.field.mixture import EMPTY, SOLID, Mixture, at_samples, mix
+from pav_blender.core.rendering.guide import neighbourhood
 from pav_blender.core.rendering.render import render
 from pav_blender.core.rendering.sequence import parse_appearance
 from pav_blender.core.rendering.wearing import deformer_of, shares_of, wearing_of
@@ -149,3 +150,9 @@ def test_each_half_of_a_head_wears_its_own(toy, toy_avatar):
         own = psnr(over(both.rgba[part], 1.0), over(alone[name].rgba[part], 1.0))
         others = psnr(over(both.rgba[part], 1.0), over(alone[other].rgba[part], 1.0))
         assert own > max(40, others + 10), (name, own, others)
+
+
+def test_a_neighbourhood_is_the_greatest_of_27_cells():
+    grids = torch.rand(2, 7, 5, 6, generator=torch.Generator().manual_seed(0))
+    pooled = torch.nn.functional.max_pool3d(grids[:, None], 3, 1, 1)[:, 0]
+    assert torch.equal(neighbourhood(grids), pooled)
