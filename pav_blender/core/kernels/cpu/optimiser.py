@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ...errors import InputError
 from ..reference.optimiser import check_adam, touched_rows
+from .lanes import LANES, bits, fma, load, splat, square_root, store
 from .threads import run_chunks
 
 CHUNK = 1 << 16
@@ -83,8 +84,37 @@ def _flat(tensor: Tensor) -> Any:
     return array
 
 
-@njit(cache=True, nogil=True, fastmath={"contract", "nsz"}, error_model="numpy")
+@njit(cache=True, nogil=True)
 def adam_range(start, stop, param, grad, m, v, settings, zero_grad):
+    """A step on values start to stop of flat arrays.
+
+    What never had a gradient stays as it is, without weight decay: it need not be read as a whole.
+    """
+    rate, spread, eps = splat(settings[0]), splat(settings[1]), splat(settings[4])
+    keep1, take1 = splat(settings[2]), splat(1 - settings[2])
+    keep2, take2 = splat(settings[3]), splat(1 - settings[3])
+    decay, zero = splat(settings[5]), splat(np.float32(0))
+    whole = start + (stop - start) // LANES * LANES
+    for at in range(start, whole, LANES):
+        g, first, second = load(grad, at), load(m, at), load(v, at)
+        untouched = bits((g == zero) & (first == zero) & (second == zero))
+        if settings[5] == 0 and untouched == (1 << LANES) - 1:
+            continue
+        value = load(param, at)
+        g = fma(decay, value, g)
+        first = fma(keep1, first, take1 * g)
+        second = fma(keep2, second, take2 * g * g)
+        store(m, at, first)
+        store(v, at, second)
+        store(param, at, value - rate * first / fma(square_root(second), spread, eps))
+        if zero_grad:
+            store(grad, at, zero)
+    _adam_rest(whole, stop, param, grad, m, v, settings, zero_grad)
+
+
+@njit(cache=True, nogil=True, fastmath={"contract", "nsz"}, error_model="numpy")
+def _adam_rest(start, stop, param, grad, m, v, settings, zero_grad):
+    """The same, one value at a time."""
     rate = np.float32(settings[0])
     spread = np.float32(settings[1])
     keep1, take1 = np.float32(settings[2]), np.float32(1 - settings[2])
