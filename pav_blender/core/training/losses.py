@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
+from .. import kernels
 from ..config import Config
 from .batches import Pixels
 
@@ -55,6 +56,9 @@ def distortion(
     weights, t, ray [N], sorted by ray and along it. Fog spreads a ray's weight: without fog fewer
     samples show the same.
     """
+    compiled = getattr(kernels.select(weights.device), "compositing", None)
+    if compiled is not None and weights.dtype == torch.float32 and not t.requires_grad:
+        return compiled.distortion(weights, t, ray, rays)
     index = ray.long()
     counts = torch.bincount(index, minlength=rays)
     place = torch.arange(len(index), device=ray.device)

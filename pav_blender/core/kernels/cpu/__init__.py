@@ -18,6 +18,7 @@ from typing import Any
 
 from .. import MODULES
 
+_ALONE = ("batches", "compositing", "networks", "tracing")  # without a counterpart in plain torch
 _KEPT_CACHES = 6
 _CHOSEN = "PAV_NUMBA_CACHE"  # what was chosen here, not by the user: child processes choose anew
 
@@ -104,7 +105,7 @@ def _tell_of_compiling() -> None:
 
 
 def __getattr__(name: str) -> Any:
-    if name in (*MODULES, "tracing", "threads"):
+    if name in (*MODULES, *_ALONE, "threads"):
         if name != "threads":
             _tell_of_compiling()
         return importlib.import_module(f"{__name__}.{name}")

@@ -1,4 +1,9 @@
-"""Compositing along rays, one pass forwards and one backwards (used through `marching.py`)."""
+"""Compositing along rays, one pass forwards and one backwards (used through `marching.py`), and how
+far apart weights lie along a ray.
+
+What each sample lets through is worked out for a register of samples at a time, rays then go one
+after the other.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +13,8 @@ import numpy as np
 import torch
 from numba import njit
 
+from .exponential import parts
+from .lanes import LANES, fma, load, splat, store
 from .search import OPTIONS
 from .threads import run_chunks
 
@@ -17,41 +24,77 @@ _CHUNK = 1024  # rays a thread takes at a time
 @njit(**OPTIONS)
 def _offsets(ray_index, rays):
     """Where each ray's samples begin, [R + 1]; -1 first when the index is unsorted or outside."""
-    offsets = np.zeros(rays + 1, np.int64)
-    previous = 0
+    offsets = np.empty(rays + 1, np.int64)
+    current = np.int64(-1)
     for i in range(len(ray_index)):
-        ray = ray_index[i]
-        if ray < previous or ray >= rays:
+        ray = np.int64(ray_index[i])
+        if ray == current:
+            continue
+        if ray < current or ray >= rays:
             offsets[0] = -1
             return offsets
-        previous = ray
-        offsets[ray + 1] += 1
-    for ray in range(rays):
-        offsets[ray + 1] += offsets[ray]
+        offsets[current + 1 : ray + 1] = i
+        current = ray
+    offsets[current + 1 :] = len(ray_index)
     return offsets
+
+
+@njit(inline="always")
+def _let_through(sigma, delta):
+    """Of a register of samples: what each takes of its light, and what it lets through."""
+    s, p = parts(splat(np.float32(0)) - sigma * delta)
+    taken = fma(splat(np.float32(0)) - s, p, splat(np.float32(1)) - s)
+    return taken, fma(s, p, s)
+
+
+@njit(**OPTIONS)
+def _opacities(first, last, sigma, delta, taken, passed):
+    """1 - exp(-sigma delta) of samples first to last, and in passed, from 0 on, what it leaves."""
+    one = splat(delta[0])
+    whole = first + (last - first) // LANES * LANES
+    for i in range(first, whole, LANES):
+        width = one if len(delta) == 1 else load(delta, i)
+        alpha, through = _let_through(load(sigma, i), width)
+        store(taken, i, alpha)
+        store(passed, i - first, through)
+    rest = np.zeros(3 * LANES, np.float32)
+    for i in range(whole, last):
+        rest[i - whole] = sigma[i]
+        rest[LANES + i - whole] = delta[0 if len(delta) == 1 else i]
+    alpha, through = _let_through(load(rest, 0), load(rest, LANES))
+    store(rest, 2 * LANES, alpha)
+    store(rest, LANES, through)
+    for i in range(whole, last):
+        taken[i] = rest[2 * LANES + i - whole]
+        passed[i - first] = rest[LANES + i - whole]
 
 
 @njit(**OPTIONS)
 def _weigh(start, stop, offsets, sigma, delta, transmittance, weights):
     """Writes the weights of the rays' samples and lowers what the rays have left."""
-    one_delta = len(delta) == 1
+    begin, end = offsets[start], offsets[stop]
+    passed = np.empty(end - begin, np.float32)
+    _opacities(begin, end, sigma, delta, weights, passed)
     for ray in range(start, stop):
         left = np.float64(transmittance[ray])
         for i in range(offsets[ray], offsets[ray + 1]):
-            # in double precision 1 - exp is as good as expm1, at half the price
-            passes = np.exp(-np.float64(sigma[i]) * delta[0 if one_delta else i])
-            weights[i] = left * (1.0 - passes)
-            left *= passes
+            weights[i] = left * weights[i]
+            left *= passed[i - begin]
         transmittance[ray] = left
 
 
 @njit(**OPTIONS)
-def _forward(start, stop, offsets, sigma, rgb, t, delta, left, colour, opacity, depth, weights):
-    _weigh(start, stop, offsets, sigma, delta, left, weights)
+def _forward(start, stop, offsets, sigma, rgb, t, delta, colour, opacity, depth, weights):
+    begin, end = offsets[start], offsets[stop]
+    passed = np.empty(end - begin, np.float32)
+    _opacities(begin, end, sigma, delta, weights, passed)
     for ray in range(start, stop):
+        left = 1.0
         red = green = blue = alpha = far = 0.0
         for i in range(offsets[ray], offsets[ray + 1]):
-            weight = np.float64(weights[i])
+            weight = left * weights[i]
+            left *= passed[i - begin]
+            weights[i] = weight
             red += weight * rgb[i, 0]
             green += weight * rgb[i, 1]
             blue += weight * rgb[i, 2]
@@ -82,30 +125,32 @@ def _backward(
 ):
     """With q_i the gradient of w_i: d/d(optical_i) = T_{i+1} q_i - sum_{j>i} w_j q_j.
 
-    No division: exact where a sample is opaque or a ray has nothing left.
+    No division: exact where a sample is opaque or a ray has nothing left. grad_t is left out where
+    it is empty.
     """
+    begin, end = offsets[start], offsets[stop]
+    passed = np.empty(end - begin, np.float32)
+    _opacities(begin, end, sigma, delta, grad_sigma, passed)
     one_delta = len(delta) == 1
     for ray in range(start, stop):
         first, last = offsets[ray], offsets[ray + 1]
-        if first == last:
-            continue
         r, g, b = grad_colour[ray, 0], grad_colour[ray, 1], grad_colour[ray, 2]
         total = 0.0
         for i in range(first, last):
             q = r * rgb[i, 0] + g * rgb[i, 1] + b * rgb[i, 2] + grad_opacity[ray]
             q += grad_depth[ray] * t[i] + grad_weights[i]
+            grad_sigma[i] = q
             total += np.float64(weights[i]) * q
         left = 1.0
         for i in range(first, last):
-            width = delta[0 if one_delta else i]
-            q = r * rgb[i, 0] + g * rgb[i, 1] + b * rgb[i, 2] + grad_opacity[ray]
-            q += grad_depth[ray] * t[i] + grad_weights[i]
-            weight = np.float64(weights[i])
-            left *= np.exp(-np.float64(sigma[i]) * width)
+            q, weight = np.float64(grad_sigma[i]), weights[i]
+            left *= passed[i - begin]
             total -= weight * q
-            grad_sigma[i] = width * (left * q - total)
+            grad_sigma[i] = delta[0 if one_delta else i] * (left * q - total)
             grad_rgb[i, 0], grad_rgb[i, 1], grad_rgb[i, 2] = weight * r, weight * g, weight * b
-            grad_t[i] = weight * grad_depth[ray]
+        if len(grad_t) > 0:
+            for i in range(first, last):
+                grad_t[i] = weights[i] * grad_depth[ray]
 
 
 def _array(values: torch.Tensor) -> np.ndarray:
@@ -138,7 +183,7 @@ class _Composite(torch.autograd.Function):
         rays: int,
     ) -> tuple[torch.Tensor, ...]:
         offsets, widths = _starts(ray_index, rays), _widths(delta, len(sigma))
-        colour, opacity, depth = torch.zeros(rays, 3), torch.zeros(rays), torch.zeros(rays)
+        colour, opacity, depth = torch.empty(rays, 3), torch.empty(rays), torch.empty(rays)
         weights = torch.empty(len(sigma))
         run_chunks(
             _forward,
@@ -149,7 +194,6 @@ class _Composite(torch.autograd.Function):
             _array(rgb),
             _array(t),
             widths,
-            np.ones(rays, np.float32),
             colour.numpy(),
             opacity.numpy(),
             depth.numpy(),
@@ -162,9 +206,9 @@ class _Composite(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *gradients: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         sigma, rgb, t, weights = ctx.saved_tensors
-        grad_sigma, grad_rgb, grad_t = (
-            torch.zeros(x.shape, dtype=torch.float32) for x in (sigma, rgb, t)
-        )
+        needs_t = ctx.needs_input_grad[2]
+        grad_sigma, grad_rgb = torch.empty(len(sigma)), torch.empty(len(sigma), 3)
+        grad_t = torch.empty(len(sigma) if needs_t else 0)
         run_chunks(
             _backward,
             len(ctx.offsets) - 1,
@@ -180,7 +224,7 @@ class _Composite(torch.autograd.Function):
             grad_rgb.numpy(),
             grad_t.numpy(),
         )
-        return grad_sigma, grad_rgb, grad_t, None, None, None
+        return grad_sigma, grad_rgb, grad_t if needs_t else None, None, None, None
 
 
 def composite(
@@ -226,3 +270,62 @@ def weigh(
         weights.numpy(),
     )
     return weights
+
+
+@njit(**OPTIONS)
+def _distances(start, stop, offsets, weights, t, sums):
+    for ray in range(start, stop):
+        before = moment = total = 0.0
+        for i in range(offsets[ray], offsets[ray + 1]):
+            weight = np.float64(weights[i])
+            total += weight * (t[i] * before - moment)
+            before += weight
+            moment += weight * t[i]
+        sums[ray] = total
+
+
+@njit(**OPTIONS)
+def _distances_back(start, stop, offsets, weights, t, scale, grad_weights):
+    """d/dw_k: the sum over the others on the ray of w_i |t_k - t_i|."""
+    for ray in range(start, stop):
+        first, last = offsets[ray], offsets[ray + 1]
+        after = moment = 0.0
+        for i in range(first, last):
+            after += weights[i]
+            moment += np.float64(weights[i]) * t[i]
+        before = passed = 0.0
+        for i in range(first, last):
+            weight = np.float64(weights[i])
+            after -= weight
+            moment -= weight * t[i]
+            grad_weights[i] = scale * (t[i] * (before - after) - passed + moment)
+            before += weight
+            passed += weight * t[i]
+
+
+class _Distortion(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, weights: torch.Tensor, t: torch.Tensor, ray_index: torch.Tensor, rays: int
+    ) -> torch.Tensor:
+        ctx.arrays = _starts(ray_index, rays), _array(weights), _array(t)
+        sums = np.empty(rays)
+        run_chunks(_distances, rays, _CHUNK, *ctx.arrays, sums)
+        return torch.tensor(2 * sums.sum() / max(rays, 1), dtype=torch.float32)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+        offsets, weights, t = ctx.arrays
+        rays = len(offsets) - 1
+        grad_weights = torch.empty(len(weights))
+        scale = 2 * float(gradients[0]) / max(rays, 1)
+        arrays = offsets, weights, t, scale, grad_weights.numpy()
+        run_chunks(_distances_back, rays, _CHUNK, *arrays)
+        return grad_weights, None, None, None
+
+
+def distortion(
+    weights: torch.Tensor, t: torch.Tensor, ray_index: torch.Tensor, rays: int
+) -> torch.Tensor:
+    """As `training.losses.distortion`; the gradient goes to the weights only."""
+    return _Distortion.apply(weights, t, ray_index, rays)
