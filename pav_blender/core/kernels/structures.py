@@ -136,6 +136,20 @@ class Picks(NamedTuple):
     distance: torch.Tensor
 
 
+class Seen(NamedTuple):
+    """What the rays of one frame, of an appearance, picked, and how they lie (`pick`): jitter [R],
+    origins and directions [R, 3]; shoulders [3, 3] and offset [3] (arrays) as in
+    `rigid.Stance`."""
+
+    picks: Picks
+    appearance: int
+    jitter: torch.Tensor
+    origins: torch.Tensor
+    directions: torch.Tensor
+    shoulders: Any
+    offset: Any
+
+
 class Layers(NamedTuple):
     """A ReLU network: weights [out, in] and biases [out] of each layer."""
 

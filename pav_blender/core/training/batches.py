@@ -13,7 +13,8 @@ from ..config import Config
 from ..deformation import Clearance, Deformer, PosedMesh, Thrift, Voxels, voxels
 from ..deformation.rigid import Stance, stance
 from ..field.field import Samples, condition
-from ..rendering.rays import TILE, Packed, RayBatch, camera_rays, pack, still_of
+from ..kernels.structures import Seen
+from ..rendering.rays import TILE, RayBatch, camera_rays
 from .attention import Attention
 from .frames import Frame
 from .occupancy import Visibility
@@ -171,8 +172,8 @@ def pick_samples(
     count = len(pixels.rays)
     stops = [*pixels.starts[1:], count]
     jitter, chance = torch.rand(2, count, generator=generator)
-    parts: list[Packed] = []
-    steps, directions, frame, ended, conditions, still = [], [], [], [], [], []
+    parts: list[Seen] = []
+    directions, ended, conditions = [], [], []
     looks = 0
     for index, (a, b) in enumerate(zip(pixels.starts, stops, strict=True)):
         appearance = pixels.frames[index].appearance
@@ -198,43 +199,23 @@ def pick_samples(
         )
         looks += int(picks.looks.sum())
         ended.append(picks.next <= last)
-        packed, slots = pack(picks, jitter[a:b], step)
-        own = RayBatch(*rays, pixels.rays.cosine[a:b])
-        still.append(still_of(packed, space, own, posed.stance))
-        packed.ray += a
-        parts.append(packed)
-        steps.append(picks.steps.view(-1)[slots])
-        frame.append(torch.full((len(packed),), index, dtype=torch.int32))
+        stance = posed.stance
+        parts.append(Seen(picks, appearance, jitter[a:b], *rays, stance.shoulders, stance.offset))
         expression = pixels.frames[index].expression
         person = None if codes is None else codes[appearance]
-        conditions.append(condition(config, expression, posed.stance.turn, person))
-        directions.append(rays[1] @ torch.from_numpy(posed.stance.rotation))
-    fields = ("ray", "t", "triangle", "barycentric", "canonical", "distance")
-    packed = Packed(*(torch.cat([getattr(p, name) for p in parts]) for name in fields))
-    appearances = torch.tensor([f.appearance for f in pixels.frames], dtype=torch.int32)
-    frames = torch.cat(frame)
-    space = visibility.spaces[0]
+        conditions.append(condition(config, expression, stance.turn, person))
+        directions.append(rays[1] @ torch.from_numpy(stance.rotation))
+    found = ops.batches.gather(parts, step, visibility.spaces[0])
     samples = Samples(
-        canonical=(packed.canonical - space.box_min) * space.box_scale,
-        still=torch.cat(still),
-        triangle=packed.triangle,
-        barycentric=packed.barycentric,
-        distance=packed.distance,
-        appearance=appearances[frames.long()],
-        frame=frames,
-        ray=packed.ray,
+        canonical=found.canonical,
+        still=found.still,
+        triangle=found.triangle,
+        barycentric=found.barycentric,
+        distance=found.distance,
+        appearance=found.appearance,
+        frame=found.frame,
+        ray=found.ray,
         condition=torch.stack(conditions),
         direction=torch.cat(directions),
     )
-    width, cells = torch.cat(steps) * step, _cells(samples, space)
-    return Picked(samples, packed.t, width, cells, looks, torch.cat(ended))
-
-
-def _cells(samples: Samples, space: Clearance) -> torch.Tensor:
-    """Flat index of (appearance, x, y, z) in the occupancy, int64."""
-    size = space.grid.shape[0]
-    cell = (samples.canonical * size).long().clamp(0, size - 1)
-    index = samples.appearance.long()
-    for axis in range(3):
-        index = index * size + cell[:, axis]
-    return index
+    return Picked(samples, found.t, found.width, found.cells, looks, torch.cat(ended))

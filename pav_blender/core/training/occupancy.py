@@ -102,14 +102,9 @@ class Visibility:
     ) -> None:
         """Takes in the samples of a batch: cell [N], density [N] (1/m), weight [N] in the pixel,
         and how far along the ray each reaches [N], metres."""
-        kernels.select("cpu").picking.follow(self.guide, cells, density)
-        # at the sample itself, from the weight: T = w / alpha
-        alpha = -torch.expm1(-density * width)
-        seen = torch.where(alpha > 1e-6, weights / alpha.clamp(min=1e-6), 1.0)
-        weights = weights / (1e3 * width)
-        self.weight.scatter_reduce_(0, cells, weights, "amax")
-        looked = cells[seen > _SEEN]
-        self.looks.index_add_(0, looked, torch.ones(len(looked)))
+        ops = kernels.select("cpu")
+        ops.picking.follow(self.guide, cells, density)
+        ops.batches.watch(self.weight, self.looks, cells, density, weights, width, _SEEN)
 
     def _judge_blocks(self) -> None:
         """Empties blocks of 2 x 2 x 2 cells that had looks enough together: there are too many
