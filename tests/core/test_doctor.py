@@ -8,12 +8,12 @@ from pathlib import Path
 
 CODE = """
 from pav_blender.cli import main
-from pav_blender.core.kernels.cpu import encoding, marching, mlp, nearest, optimiser, picking
-from pav_blender.core.kernels.cpu import tracing
+from pav_blender.core.kernels.cpu import batches, encoding, marching, nearest, networks, optimiser
+from pav_blender.core.kernels.cpu import picking, tracing
 kernels = (picking._pick, picking._follow, picking._brick_cells, marching._march, nearest._nearest,
            picking._add_torn, tracing._trace, tracing._look_up,
-           mlp._forward_samples, mlp._backward_parts, encoding._encode_levels,
-           encoding._adam_levels, optimiser.adam_range)
+           networks._forward, networks._backward, encoding._encode_levels,
+           encoding._adam_level, optimiser.adam_range, batches._gather, batches._watch)
 assert not any(kernel.signatures for kernel in kernels)
 assert main(["doctor", "--compile"]) == 0
 assert all(kernel.signatures for kernel in kernels), kernels

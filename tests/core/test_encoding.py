@@ -188,6 +188,33 @@ def test_adam_on_tables_is_backward_and_then_adam(layout, count):
     assert not torch.equal(ours[0], tables)
 
 
+@BOTH
+def test_grids_side_by_side_are_each_by_itself(kernels):
+    layouts = SMALL, Layout(levels=2, log2_entries=9, base=8, finest=16)
+    points = [random_points(700), random_points(700, 5)]
+    tables = [random_tables(layout) for layout in layouts]
+    alone = torch.cat(
+        [kernels.encode(*grid) for grid in zip(points, tables, layouts, strict=True)], 1
+    )
+    learned = [table.clone().requires_grad_() for table in tables]
+    for held in (tables, learned):
+        both = kernels.encode_all([*zip(points, held, layouts, strict=True)])
+        assert torch.equal(both, alone)
+    both.sum().backward()
+    assert all(table.grad.abs().sum() > 0 for table in learned)
+
+    parts = torch.randn(700, alone.shape[1]).split([layout.width for layout in layouts], 1)
+    zeros = [[torch.zeros_like(table) for table in tables] for _ in range(4)]
+    own, other = [t.clone() for t in tables], [t.clone() for t in tables]
+    grids = zip(points, parts, own, *zeros[:2], layouts, strict=True)
+    kernels.encode_adam_steps([*grids], step=1, lr=1e-2)
+    for grid in zip(points, parts, other, *zeros[2:], layouts, strict=True):
+        kernels.encode_adam_step(*grid, step=1, lr=1e-2)
+    for one, two, before in zip(own, other, tables, strict=True):
+        assert torch.equal(one, two)
+        assert not torch.equal(one, before)
+
+
 def test_reference_gradients():
     layout = Layout(levels=3, log2_entries=6, base=2, finest=7)
     points = torch.rand(5, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(3))

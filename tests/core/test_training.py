@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 import torch
 
+from pav_blender.core import kernels
 from pav_blender.core.collection import read_collection
 from pav_blender.core.errors import Cancelled, InputError
 from pav_blender.core.evaluation.heldout import held_out, score
 from pav_blender.core.evaluation.report import figures, measure
 from pav_blender.core.field.avatar import Avatar
+from pav_blender.core.field.field import Field
+from pav_blender.core.rendering.rays import RayBatch, pack, still_of
 from pav_blender.core.rendering.render import RenderSettings, pose_scene
 from pav_blender.core.training.attention import Attention
 from pav_blender.core.training.batches import draw_pixels, pick_samples
@@ -324,6 +327,97 @@ def test_scores_compare_with_the_frames_own_picture(toy, toy_avatar):
     assert worn.psnr < scores[0].psnr
 
 
+def test_one_pass_learns_what_network_by_network_does(toy, frames, small_config, monkeypatch):
+    """The field's networks in one pass, and one by one through autograd: the same weights."""
+    states = []
+    for one_by_one in (False, True):
+        if one_by_one:
+            monkeypatch.setattr(Field, "forward", _network_by_network)
+        trainer = Trainer(new_avatar(toy, frames, small_config), frames)
+        for _ in range(4):
+            trainer.iterate()
+        states.append(trainer.avatar.field.state_dict())
+    moved = new_avatar(toy, frames, small_config).field.state_dict()
+    for name, value in states[0].items():
+        if name in moved and value.numel():
+            # Adam takes steps of one size: what is compared is whether they went the same way
+            step = (value - moved[name]).abs().mean()
+            assert (value - states[1][name]).abs().mean() <= 0.02 * step + 1e-9, name
+
+
+def _network_by_network(field, samples, worn=None, encoded=None):
+    density, inputs = field.geometry(samples, worn, encoded)
+    return density, field.shade(inputs, samples.direction, samples.ray)
+
+
+def test_a_batch_is_gathered_as_pictures_gather_it(toy, frames, small_config):
+    """Where samples of training lie is what `pack` and `still_of` of pictures say."""
+    trainer = Trainer(new_avatar(toy, frames, small_config), frames)
+    chosen, packs = [frames[0], frames[-1]], []
+    pick = kernels.select("cpu").picking.pick
+    pixels = draw_pixels(chosen, 200, np.random.default_rng(0))
+
+    def kept(*args, **settings):
+        packs.append((args, pick(*args, **settings)))
+        return packs[-1][1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(kernels.select("cpu").picking, "pick", kept)
+        generator = torch.Generator().manual_seed(0)
+        state = trainer._poses, pixels, trainer.visibility, small_config, 2e-3, generator
+        picked = pick_samples(*state)
+    space, got = trainer.visibility.spaces[0], picked.samples
+    at = 0
+    for number, (args, picks) in enumerate(packs):
+        origins, directions, jitter = args[3], args[4], args[7]
+        packed, slots = pack(picks, jitter, 2e-3)
+        own = slice(at, at + len(packed))
+        frame = pixels.frames[number]
+        posed = trainer._poses(frame, space, trainer.visibility.version, small_config.reach)
+        rays = RayBatch(origins, directions, torch.ones(len(origins)))
+        wanted = {
+            "canonical": (packed.canonical - space.box_min) * space.box_scale,
+            "still": still_of(packed, space, rays, posed.stance),
+            "triangle": packed.triangle,
+            "barycentric": packed.barycentric,
+            "distance": packed.distance,
+            "ray": packed.ray + pixels.starts[number],
+            "frame": torch.full((len(packed),), number, dtype=torch.int32),
+            "appearance": torch.full((len(packed),), frame.appearance, dtype=torch.int32),
+        }
+        for name, value in wanted.items():
+            torch.testing.assert_close(getattr(got, name)[own], value, rtol=1e-5, atol=2e-6)
+        torch.testing.assert_close(picked.t[own], packed.t)
+        torch.testing.assert_close(picked.width[own], picks.steps.view(-1)[slots] * 2e-3)
+        cell = (got.canonical[own] * len(space.grid)).long()
+        size = len(space.grid)
+        flat = ((frame.appearance * size + cell[:, 0]) * size + cell[:, 1]) * size + cell[:, 2]
+        assert torch.equal(picked.cells[own], flat)
+        at += len(packed)
+    assert at == len(picked.t) > 500
+
+
+def test_cells_are_watched_as_the_samples_say(monkeypatch):
+    generator = torch.Generator().manual_seed(0)
+    count = 2000
+    cells = torch.randint(0, 300, (count,), generator=generator)
+    density = torch.rand(count, generator=generator) ** 8 * 3e3
+    density[:50] = 0
+    width = torch.rand(count, generator=generator) * 3e-3 + 1e-3
+    alpha = -torch.expm1(-density * width)
+    light = torch.rand(count, generator=generator)
+    weights = light * alpha
+    most, looks = torch.rand(300, generator=generator) * 0.01, torch.ones(300)
+    wanted = most.clone().scatter_reduce_(0, cells, weights / (1e3 * width), "amax")
+    seen = (light > 0.1) | (alpha <= 1e-6)
+    counted = looks.clone().index_add_(0, cells[seen], torch.ones(int(seen.sum())))
+    monkeypatch.setattr("pav_blender.core.kernels.cpu.batches.threads", lambda: 3)
+    kernels.select("cpu").batches.watch(most, looks, cells, density, weights, width, 0.1)
+    torch.testing.assert_close(most, wanted)
+    assert float((looks - counted).abs().sum()) <= 2  # at the limit, rounding decides
+    assert float(looks.sum()) > 1000
+
+
 def test_distortion_is_the_sum_over_pairs_and_learns():
     generator = torch.Generator().manual_seed(0)
     ray = torch.tensor([0, 0, 0, 2, 2, 2, 2, 3], dtype=torch.int32)  # ray 1 has no sample
@@ -339,3 +433,17 @@ def test_distortion_is_the_sum_over_pairs_and_learns():
     assert torch.autograd.gradcheck(lambda w: distortion(w, t, ray, 4), (weights,))
     none = torch.zeros(0)
     assert distortion(none, none, none.int(), 3) == 0
+
+
+def test_compiled_distortion_is_that_of_plain_torch():
+    generator = torch.Generator().manual_seed(0)
+    ray = torch.randint(0, 60, (500,), generator=generator).sort().values.int()
+    t = torch.rand(500, generator=generator) * 0.1 + 0.5
+    results = []
+    for kind in (torch.float32, torch.float64):  # plain torch takes what is no float32
+        weights = torch.rand(500, generator=generator.manual_seed(1)).to(kind).requires_grad_()
+        value = distortion(weights, t.to(kind), ray, 64)
+        (3 * value).backward()
+        results.append((value.detach().double(), weights.grad.double()))
+    for got, want in zip(*results, strict=True):
+        torch.testing.assert_close(got, want, rtol=1e-5, atol=1e-8)

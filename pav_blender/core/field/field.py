@@ -18,6 +18,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 import torch
@@ -112,6 +113,11 @@ class Mlp(nn.Module):
         bias = group_input @ self.group_weight.T
         return ops.mlp.mlp(x, list(self.weights), list(self.biases), bias, group)
 
+    def network(self, compiled: Any, group_input: torch.Tensor) -> Any:
+        """As the compiled kernels take it."""
+        bias = group_input @ self.group_weight.T
+        return compiled.Network(list(self.weights), list(self.biases), bias)
+
 
 class Field(nn.Module):
     """The networks and tables of one avatar; its `state_dict` is what a `.pav` holds.
@@ -189,22 +195,20 @@ class Field(nn.Module):
         """Z^x [N, C]: the appearance's latent features at the nearest surface point."""
         ops = kernels.select(self.tables.device)
         if self.config.appearance == "vertex":
-            features = ops.encoding.read_vertices(
-                worn.latent,
-                samples.appearance,
-                self.triangles,
-                samples.triangle,
-                samples.barycentric,
+            latent = worn.latent
+            if worn.code.shape[1]:  # shares of vertices add up to 1
+                latent = latent + worn.code[:, None]
+            return ops.encoding.read_vertices(
+                latent, samples.appearance, self.triangles, samples.triangle, samples.barycentric
             )
-        elif self.config.appearance == "surface":
+        if self.config.appearance == "surface":
             corners = self.corner_uvs[samples.triangle.long()]
             uv = (corners * samples.barycentric[:, :, None]).sum(1)
             features = ops.encoding.read_texture(worn.latent, samples.appearance, uv)
-        else:
-            return worn.latent[samples.appearance.long()]
-        if worn.code.shape[1] == 0:
-            return features
-        return features + worn.code[samples.appearance.long()]
+            return (
+                features + worn.code[samples.appearance.long()] if worn.code.numel() else features
+            )
+        return worn.latent[samples.appearance.long()]
 
     @property
     def encoded_width(self) -> int:
@@ -213,12 +217,10 @@ class Field(nn.Module):
 
     def encode(self, samples: Samples) -> torch.Tensor:
         """phi(x_c), and that of the place that rests with the shoulders, [N, encoded_width]."""
-        encode = kernels.select(self.tables.device).encoding.encode
-        features = encode(samples.canonical, self.tables, self.layout)
-        if self.still_layout is None:
-            return features
-        still = encode(samples.still, self.still_tables, self.still_layout)
-        return torch.cat([features, still], 1)
+        grids = [(samples.canonical, self.tables, self.layout)]
+        if self.still_layout is not None:
+            grids.append((samples.still, self.still_tables, self.still_layout))
+        return kernels.select(self.tables.device).encoding.encode_all(grids)
 
     def geometry(
         self, samples: Samples, worn: Worn | None = None, encoded: torch.Tensor | None = None
@@ -266,8 +268,45 @@ class Field(nn.Module):
         self, samples: Samples, worn: Worn | None = None, encoded: torch.Tensor | None = None
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Density [N] per metre and colour [N, 3], sRGB in [0, 1]; arguments as `geometry`."""
-        density, inputs = self.geometry(samples, worn, encoded)
-        return density, self.shade(inputs, samples.direction, samples.ray)
+        compiled = getattr(kernels.select(self.device), "networks", None)
+        if compiled is None:
+            density, inputs = self.geometry(samples, worn, encoded)
+            return density, self.shade(inputs, samples.direction, samples.ray)
+        config, offset = self.config, None
+        view = directions.spherical_harmonics(samples.direction)
+        if self.offset is not None:
+            offset = self.offset.network(compiled, samples.condition)
+            offset.weights[0] = self.spread(offset.weights[0])
+        return compiled.evaluate(
+            self.encode(samples) if encoded is None else encoded,
+            self.embedding(samples, worn or self.worn),
+            samples.distance,
+            samples.frame,
+            samples.ray,
+            self.density.network(compiled, samples.condition),
+            offset,
+            self.colour.network(compiled, view),
+            self.untrained_numbers,
+            config.log_density_limit,
+        )
+
+    def spread(self, weight: torch.Tensor) -> torch.Tensor:
+        """The offset's first weight [hidden, C] as one of the embedding and the whole geometry: the
+        log-density is not seen."""
+        config = self.config
+        own, rest = config.embedding_channels, config.geometry_channels
+        if config.offset_sees_geometry:
+            return torch.cat(
+                [weight[:, :own], weight.new_zeros(len(weight), 1), weight[:, own:]], 1
+            )
+        return torch.nn.functional.pad(weight, (0, rest))
+
+    @property
+    def untrained_numbers(self) -> tuple[float, float, float, float]:
+        """What `untrained` is made of, as `structures.Frozen` has it."""
+        config = self.config
+        rise = config.mesh_density - config.density_bias if config.start_on_mesh else 0.0
+        return config.density_bias, rise, config.mesh_falloff, config.mesh_skin
 
     @property
     def device(self) -> torch.device:

@@ -267,41 +267,43 @@ class Trainer:
         decay = config.final_learning_rate**late * min(1.0, step / _WARM_UP)
         rates = {
             "offset": config.offset_learning_rate,
-            "tables": config.table_learning_rate,
-            "still_tables": config.table_learning_rate,
             "latent": config.latent_learning_rate,
             "code": config.latent_learning_rate,
         }
-        own = field.layout.width
-        encodings = {
-            "tables": (samples.canonical, field.layout, slice(0, own)),
-            "still_tables": (samples.still, field.still_layout, slice(own, None)),
+        settings: dict[str, Any] = {
+            "step": step,
+            "beta1": config.beta1,
+            "beta2": config.beta2,
+            "eps": config.epsilon,
         }
+        kept = {**settings, "zero_grad": False}
         for name, parameter in field.named_parameters():
-            m, v = self.moments[name]
-            settings = {
-                "step": step,
-                "lr": rates.get(name.partition(".")[0], config.learning_rate) * decay,
-                "beta1": config.beta1,
-                "beta2": config.beta2,
-                "eps": config.epsilon,
-            }
-            if name in encodings:
-                if encoded.grad is not None:
-                    points, layout, columns = encodings[name]
-                    part = encoded.grad[:, columns].contiguous()
-                    state = parameter.data, m, v, layout
-                    ops.encoding.encode_adam_step(points, part, *state, **settings)
-                continue
             grad = parameter.grad
             if grad is None or parameter.numel() == 0:
                 continue
+            m, v = self.moments[name]
+            lr = rates.get(name.partition(".")[0], config.learning_rate) * decay
             if name == "latent" and config.appearance == "surface":
                 values = (parameter.data, grad, m, v)
                 rows = [x.view(-1, x.shape[-1]) for x in values]
-                ops.optimiser.sparse_adam_step(*rows, **settings)
+                ops.optimiser.sparse_adam_step(*rows, **kept, lr=lr)
             else:
-                ops.optimiser.adam_step(parameter.data, grad, m, v, **settings)
+                ops.optimiser.adam_step(parameter.data, grad, m, v, **kept, lr=lr)
+            parameter.grad = None
+        if encoded.grad is None:
+            return
+        own = field.layout.width
+        grids = [(samples.canonical, encoded.grad[:, :own], "tables", field.layout)]
+        if field.still_layout is not None:
+            grids.append((samples.still, encoded.grad[:, own:], "still_tables", field.still_layout))
+        ops.encoding.encode_adam_steps(
+            [
+                (points, grad, getattr(field, name).data, *self.moments[name], layout)
+                for points, grad, name, layout in grids
+            ],
+            **settings,
+            lr=config.table_learning_rate * decay,
+        )
 
     def _note(self, loss: Loss, samples: float) -> None:
         status = self.status

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -30,6 +30,8 @@ __all__ = [
     "Layout",
     "encode",
     "encode_adam_step",
+    "encode_adam_steps",
+    "encode_all",
     "encode_backward_into",
     "read_texture",
     "read_texture_backward_into",
@@ -64,6 +66,30 @@ def encode_backward_into(
     _run_levels(_backward_levels, len(points), layout, *arrays, level_array(layout))
 
 
+def encode_all(grids: Sequence[tuple[Tensor, Tensor, Layout]]) -> Tensor:
+    """As the reference; lies in memory as what `encode` returns."""
+    for points, tables, layout in grids:
+        check_encode(points, tables, layout)
+        _refuse_gradient("encode_all", "points", points)
+    if torch.is_grad_enabled() and any(tables.requires_grad for _, tables, _ in grids):
+        return torch.cat([encode(*grid).t() for grid in grids]).t()
+    out = torch.empty(sum(layout.width for _, _, layout in grids), len(grids[0][0]))
+    pieces, at = [], 0
+    for points, tables, layout in grids:
+        part = out[at : at + layout.width]
+        arrays = _array(points), _array(tables).reshape(-1), part.view(-1).numpy()
+        pieces += [(*arrays, level) for level in level_array(layout)]
+        at += layout.width
+    run_chunks(_encode_pieces, len(pieces), 1, pieces)
+    return out.t()
+
+
+def _encode_pieces(first: int, end: int, pieces: list[tuple[Any, ...]]) -> None:
+    encode_levels: Callable[..., Any] = _encode_levels
+    for *arrays, level in pieces[first:end]:
+        encode_levels(0, 1, *arrays, level[None])
+
+
 def encode_adam_step(
     points: Tensor,
     grad_out: Tensor,
@@ -71,6 +97,14 @@ def encode_adam_step(
     m: Tensor,
     v: Tensor,
     layout: Layout,
+    **settings: Any,
+) -> None:
+    """As the reference; a level's gradient is used while it lies in the cache, and forgotten."""
+    encode_adam_steps([(points, grad_out, tables, m, v, layout)], **settings)
+
+
+def encode_adam_steps(
+    grids: Sequence[tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Layout]],
     *,
     step: int,
     lr: float,
@@ -79,14 +113,25 @@ def encode_adam_step(
     eps: float = 1e-15,
     weight_decay: float = 0.0,
 ) -> None:
-    """As the reference; a level's gradient is used while it lies in the cache, and forgotten."""
-    check_encode(points, tables, layout)
-    check_adam(tables, tables, m, v, step)
-    state = [_flat_in_place(tensor) for tensor in (tables, m, v)]
+    """As the reference; see `encode_adam_step`."""
     settings = adam_settings(step, lr, beta1, beta2, eps, weight_decay)
-    sizes = np.array(layout.sizes[::-1], np.int64)
-    arrays = _array(points), _array(grad_out.t()).reshape(-1), *state, settings, sizes
-    _run_levels(_adam_levels, len(points), layout, *arrays, level_array(layout))
+    pieces: list[tuple[Any, ...]] = []
+    for points, grad_out, tables, m, v, layout in grids:
+        check_encode(points, tables, layout)
+        check_adam(tables, tables, m, v, step)
+        state = [_flat_in_place(tensor) for tensor in (tables, m, v)]
+        arrays = _array(points), _array(grad_out.t()).reshape(-1), *state, settings
+        sizes = layout.sizes[::-1]
+        pieces += [(*arrays, *own) for own in zip(sizes, level_array(layout), strict=True)]
+    # the large ones first, so that short ones fill the gap at the end
+    pieces.sort(key=lambda piece: -piece[-2])
+    run_chunks(_adam_pieces, len(pieces), 1, pieces)
+
+
+def _adam_pieces(first: int, end: int, pieces: list[tuple[Any, ...]]) -> None:
+    adam_level: Callable[..., Any] = _adam_level
+    for piece in pieces[first:end]:
+        adam_level(*piece)
 
 
 class _Encode(torch.autograd.Function):
@@ -183,14 +228,12 @@ def _backward_levels(first, end, points, grad_out, grad_table, levels):
 
 
 @njit(cache=True, nogil=True)
-def _adam_levels(first, end, points, grad_out, table, m, v, settings, sizes, levels):
-    scratch = _scratch()
-    for k in range(first, end):
-        res, entry, mask, level = levels[k]
-        grad = np.zeros(2 * sizes[k], np.float32)
-        _backward_level(points, grad_out, level, res, np.int64(0), mask, grad, scratch)
-        low, high = 2 * entry, 2 * (entry + sizes[k])
-        adam_range(0, high - low, table[low:high], grad, m[low:high], v[low:high], settings, False)
+def _adam_level(points, grad_out, table, m, v, settings, size, row):
+    res, entry, mask, level = row
+    grad = np.zeros(2 * size, np.float32)
+    _backward_level(points, grad_out, level, res, np.int64(0), mask, grad, _scratch())
+    low, high = 2 * entry, 2 * (entry + size)
+    adam_range(0, high - low, table[low:high], grad, m[low:high], v[low:high], settings, False)
 
 
 def read_texture(latent: Tensor, appearance: Tensor, uv: Tensor) -> Tensor:

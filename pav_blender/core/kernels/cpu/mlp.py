@@ -71,11 +71,11 @@ def mlp_backward(
     blocks = -(-count // BLOCK)
     parts = max(1, min(PARTS, blocks // 4))
     size = -(-blocks // parts) * BLOCK
-    sums = np.zeros((parts, _sums_size(plan)), np.float32)
+    sums = np.zeros((parts, sums_size(plan)), np.float32)
     values, turned = _rows(x)
     grad_x = torch.empty(values.shape if need_x else (0, 0))
     bias_rows, which = _group_arrays(group_bias, group)
-    spans = _group_spans(which, size, parts)
+    spans = group_spans(which, size, parts)
     group_sums = np.zeros((int(spans[:, 2].sum()), bias_rows.shape[1]), np.float32)
     run_chunks(
         _backward_parts,
@@ -88,19 +88,16 @@ def mlp_backward(
         plan,
         bias_rows,
         which,
-        _array(grad_out),
+        array_of(grad_out),
         grad_x.numpy(),
         sums,
         spans,
         group_sums,
     )
-    grad_weights, grad_biases = _unpack(plan, sums.sum(0))
+    grad_weights, grad_biases = unpack(plan, sums.sum(0))
     grad_group = None
     if group_bias is not None:
-        summed = np.zeros(tuple(group_bias.shape), np.float32)
-        for low, at, length in spans:
-            summed[low : low + length] += group_sums[at : at + length]
-        grad_group = torch.from_numpy(summed)
+        grad_group = sum_of_groups(tuple(group_bias.shape), spans, group_sums)
     if turned:
         grad_x = grad_x.t()
     return Gradients(grad_x if need_x else None, grad_weights, grad_biases, grad_group)
@@ -147,7 +144,7 @@ def _plan(sizes: tuple[int, ...]) -> np.ndarray:
     return plan
 
 
-def _sums_size(plan: np.ndarray) -> int:
+def sums_size(plan: np.ndarray) -> int:
     return int(plan[-1, GRAD_BIAS] + plan[-1, OUT_PAD])
 
 
@@ -157,11 +154,11 @@ def pack(weights: Sequence[Tensor], biases: Sequence[Tensor]) -> tuple[np.ndarra
     last = plan[-1]
     packed = np.zeros(last[BACKWARD] + last[OUT] * last[IN_PAD], np.float32)
     for row, weight, bias in zip(plan, weights, biases, strict=True):
-        _pack_layer(_array(weight), _array(bias), row, packed)
+        _pack_layer(array_of(weight), array_of(bias), row, packed)
     return plan, packed
 
 
-def _unpack(plan: np.ndarray, sums: np.ndarray) -> tuple[list[Tensor], list[Tensor]]:
+def unpack(plan: np.ndarray, sums: np.ndarray) -> tuple[list[Tensor], list[Tensor]]:
     """Gradients of weights and biases from the sums of all layers."""
     weights, biases = [], []
     for row in plan:
@@ -179,16 +176,16 @@ def _padded(size: int) -> int:
 def _rows(x: Tensor) -> tuple[np.ndarray, bool]:
     """The inputs as an array [N,in], or [in,N] and True where they lie feature by feature."""
     turned = not x.is_contiguous() and x.t().is_contiguous()
-    return _array(x.t() if turned else x), turned
+    return array_of(x.t() if turned else x), turned
 
 
 def _group_arrays(group_bias: Tensor | None, group: Tensor | None) -> tuple[np.ndarray, np.ndarray]:
     if group_bias is None or group is None:
         return np.zeros((0, 0), np.float32), np.zeros(0, np.int32)
-    return _array(group_bias), group.detach().to(torch.int32).contiguous().numpy()
+    return array_of(group_bias), group.detach().to(torch.int32).contiguous().numpy()
 
 
-def _group_spans(which: np.ndarray, size: int, parts: int) -> np.ndarray:
+def group_spans(which: np.ndarray, size: int, parts: int) -> np.ndarray:
     """Lowest group, first row of its own sums, and number of rows, for every part.
 
     Groups mostly come in order (rays, frames), so that the parts' sums barely overlap.
@@ -204,7 +201,15 @@ def _group_spans(which: np.ndarray, size: int, parts: int) -> np.ndarray:
     return spans
 
 
-def _array(tensor: Tensor) -> Any:
+def sum_of_groups(shape: tuple[int, ...], spans: np.ndarray, group_sums: np.ndarray) -> Tensor:
+    """The parts' sums together [G, hidden]; spans as `group_spans`."""
+    summed = np.zeros(shape, np.float32)
+    for low, at, length in spans:
+        summed[low : low + length] += group_sums[at : at + length]
+    return torch.from_numpy(summed)
+
+
+def array_of(tensor: Tensor) -> Any:
     if tensor.device.type != "cpu" or tensor.dtype != torch.float32:
         raise InputError(
             f"CPU kernels work on float32 in main memory, not on {tensor.dtype} on {tensor.device}"
@@ -353,26 +358,33 @@ def _backward_parts(first, end, size, x, turned, packed, plan, bias_rows, group,
                 multiply(row[OUT], row[IN], block, plain, sums[part], grad_at, in_step,
                          sums[part], grad_at, in_step, slopes, at, one, step,
                          work, in_at, in_step, work, in_at, in_step)  # fmt: skip
-                _add_rows(slopes, at, step, count, sums[part], row[GRAD_BIAS])
+                add_rows(slopes, at, step, count, sums[part], row[GRAD_BIAS])
                 if layer > 0 or len(grad_x) > 0:
                     finish = MASKED if layer > 0 else PLAIN
                     multiply(block, row[IN], row[OUT], finish, slopes, in_at, in_step,
                              zeros, zero, zero, slopes, at, step, one,
                              packed, row[BACKWARD], in_step, work, in_at, in_step)  # fmt: skip
             if len(bias_rows) > 0:
-                own = spans[part, 1] - spans[part, 0]
-                for i in range(count):
-                    target = group_sums[own + group[begin + i]]
-                    at = start[HIDDEN] + i * start[OUT_PAD]
-                    line = slopes[at : at + len(target)]
-                    for k in range(len(target)):
-                        target[k] += line[k]
+                add_group_rows(begin, count, start, group, slopes, spans[part], group_sums)
             if len(grad_x) > 0:
                 _copy_out(slopes, zero, start[IN_PAD], grad_x, turned, begin, count)
 
 
 @njit(cache=True, nogil=True)
-def _add_rows(work, at, step, count, total, total_at):
+def add_group_rows(begin, count, row, group, slopes, span, group_sums):
+    """Add the slopes of a first layer to the sums of the samples' groups; span as `group_spans`."""
+    own = span[1] - span[0]
+    for i in range(count):
+        target = group_sums[own + group[begin + i]]
+        at = row[HIDDEN] + i * row[OUT_PAD]
+        line = slopes[at : at + len(target)]
+        for k in range(len(target)):
+            target[k] += line[k]
+
+
+@njit(cache=True, nogil=True)
+def add_rows(work, at, step, count, total, total_at):
+    """Add `count` rows of work to one another, and to total."""
     column = total[total_at : total_at + step]
     for i in range(count):
         line = work[at + i * step : at + (i + 1) * step]

@@ -6,7 +6,9 @@ whose corners index a table of features, directly where the grid fits, by a spat
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -105,6 +107,11 @@ def encode(points: Tensor, tables: Tensor, layout: Layout) -> Tensor:
     return torch.cat(parts, 1)
 
 
+def encode_all(grids: Sequence[tuple[Tensor, Tensor, Layout]]) -> Tensor:
+    """What several grids (points, tables, layout) encode, side by side: [N, their widths]."""
+    return torch.cat([encode(*grid) for grid in grids], 1)
+
+
 def encode_backward_into(
     points: Tensor, grad_out: Tensor, grad_tables: Tensor, layout: Layout
 ) -> None:
@@ -150,6 +157,14 @@ def encode_adam_step(
         eps=eps,
         weight_decay=weight_decay,
     )
+
+
+def encode_adam_steps(
+    grids: Sequence[tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Layout]], **settings: Any
+) -> None:
+    """`encode_adam_step` of several grids (its arguments up to the layout)."""
+    for grid in grids:
+        encode_adam_step(*grid, **settings)
 
 
 def read_texture(latent: Tensor, appearance: Tensor, uv: Tensor) -> Tensor:
