@@ -9,7 +9,7 @@ from test_field import TINY, make_field, make_samples
 
 from pav_blender.core import kernels
 from pav_blender.core.errors import InputError
-from pav_blender.core.kernels.cpu import exponential, mlp, networks
+from pav_blender.core.kernels.cpu import exponential
 
 FIELDS = {
     "default": TINY,
@@ -143,22 +143,3 @@ def test_exponentials_are_within_their_bound():
     assert edges[1] == 1
     assert 0 <= edges[2] == edges[5] < 1e-37
     assert 1e38 < edges[3] == edges[4]
-
-
-def test_layers_of_few_outputs_are_products_too():
-    """Their weights' gradients take a way of their own."""
-    assert networks._FEW >= 3
-    generator = torch.Generator().manual_seed(0)
-    plan = mlp.pack([torch.zeros(5, 4), torch.zeros(3, 5)], [torch.zeros(5), torch.zeros(3)])[0]
-    work, slopes = mlp.workspace(plan), mlp.workspace(plan)
-    hidden, out = torch.randn(7, 5, generator=generator), torch.randn(7, 3, generator=generator)
-    last, before = plan[1], plan[0]
-    for i in range(7):
-        at = before[mlp.HIDDEN] + i * before[mlp.OUT_PAD]
-        work[at : at + 5] = hidden[i]
-        at = last[mlp.HIDDEN] + i * last[mlp.OUT_PAD]
-        slopes[at : at + 3] = out[i]
-    sums = np.ones(mlp.sums_size(plan), np.float32)
-    networks._add_products(7, last, slopes, work, before[mlp.HIDDEN], sums)
-    weights, _ = mlp.unpack(plan, sums)
-    torch.testing.assert_close(weights[1], 1 + out.T @ hidden)

@@ -25,8 +25,11 @@ from .tiles import LANES, MASKED, PLAIN, RELU, ROWS, multiply
 BLOCK = 8 * ROWS  # samples that go through the layers together
 CHUNK = 16 * BLOCK  # samples handed to a thread at a time
 PARTS = 16  # sums of gradients are kept this many times over: their order never depends on threads
-# Columns of a plan, one row a layer: sizes, sizes rounded up to LANES, and where things begin.
+# Columns of a plan, one row a layer: sizes, sizes rounded up to LANES, where things begin, and
+# whether the weights' gradient is kept [in, out], because tiles fit that better.
 IN, OUT, IN_PAD, OUT_PAD, FORWARD, BIAS, BACKWARD, HIDDEN, GRAD_WEIGHT, GRAD_BIAS = range(10)
+TURNED = 10
+FEW = 3  # outputs of a layer of which a product's tiles, rows of them, would be mostly surplus
 
 
 def mlp(
@@ -129,15 +132,19 @@ class _Mlp(torch.autograd.Function):
 
 @lru_cache(maxsize=64)
 def _plan(sizes: tuple[int, ...]) -> np.ndarray:
-    """Where everything of a network lies: [layers, 10] int64."""
-    plan = np.zeros((len(sizes) - 1, 10), np.int64)
+    """Where everything of a network lies: [layers, 11] int64."""
+    plan = np.zeros((len(sizes) - 1, 11), np.int64)
     at = sums = 0
     hidden = BLOCK * _padded(sizes[0])  # after the inputs
     for row, ins, outs in zip(plan, sizes[:-1], sizes[1:], strict=True):
         in_pad, out_pad = _padded(ins), _padded(outs)
         bias = at + ins * out_pad
-        grad_bias = sums + -(-outs // ROWS) * ROWS * in_pad
-        row[:] = ins, outs, in_pad, out_pad, at, bias, bias + out_pad, hidden, sums, grad_bias
+        upright = -(-outs // ROWS) * ROWS * in_pad
+        lying = -(-ins // ROWS) * ROWS * out_pad
+        turned = outs > FEW and lying < upright
+        grad_bias = sums + (lying if turned else upright)
+        places = at, bias, bias + out_pad, hidden, sums, grad_bias
+        row[:] = ins, outs, in_pad, out_pad, *places, turned
         at = bias + out_pad + outs * in_pad
         hidden += BLOCK * out_pad
         sums = grad_bias + out_pad
@@ -162,9 +169,12 @@ def unpack(plan: np.ndarray, sums: np.ndarray) -> tuple[list[Tensor], list[Tenso
     """Gradients of weights and biases from the sums of all layers."""
     weights, biases = [], []
     for row in plan:
-        ins, outs, pad = row[IN], row[OUT], row[IN_PAD]
-        weight = sums[row[GRAD_WEIGHT] : row[GRAD_WEIGHT] + outs * pad].reshape(outs, pad)
-        weights.append(torch.from_numpy(weight[:, :ins].copy()))
+        ins, outs, begin = row[IN], row[OUT], row[GRAD_WEIGHT]
+        if row[TURNED]:
+            weight = sums[begin : begin + ins * row[OUT_PAD]].reshape(ins, -1)[:, :outs].T
+        else:
+            weight = sums[begin : begin + outs * row[IN_PAD]].reshape(outs, -1)[:, :ins]
+        weights.append(torch.from_numpy(weight.copy()))
         biases.append(torch.from_numpy(sums[row[GRAD_BIAS] : row[GRAD_BIAS] + outs].copy()))
     return weights, biases
 
@@ -337,7 +347,7 @@ def _backward_parts(first, end, size, x, turned, packed, plan, bias_rows, group,
     work = workspace(plan)
     slopes = np.zeros_like(work)
     zero, one, block = np.int64(0), np.int64(1), np.int64(BLOCK)
-    plain, no = np.int64(PLAIN), np.bool_(False)
+    no = np.bool_(False)
     zeros = np.zeros(plan[:, IN_PAD].max(), np.float32)
     start, last = plan[0], plan[-1]
     total = len(grad_out)
@@ -354,10 +364,7 @@ def _backward_parts(first, end, size, x, turned, packed, plan, bias_rows, group,
                 at, step = row[HIDDEN], row[OUT_PAD]
                 in_at = plan[layer - 1, HIDDEN] if layer > 0 else 0
                 in_step = row[IN_PAD]
-                grad_at = row[GRAD_WEIGHT]
-                multiply(row[OUT], row[IN], block, plain, sums[part], grad_at, in_step,
-                         sums[part], grad_at, in_step, slopes, at, one, step,
-                         work, in_at, in_step, work, in_at, in_step)  # fmt: skip
+                add_weights(count, row, slopes, work, in_at, in_step, sums[part])
                 add_rows(slopes, at, step, count, sums[part], row[GRAD_BIAS])
                 if layer > 0 or len(grad_x) > 0:
                     finish = MASKED if layer > 0 else PLAIN
@@ -368,6 +375,29 @@ def _backward_parts(first, end, size, x, turned, packed, plan, bias_rows, group,
                 add_group_rows(begin, count, start, group, slopes, spans[part], group_sums)
             if len(grad_x) > 0:
                 _copy_out(slopes, zero, start[IN_PAD], grad_x, turned, begin, count)
+
+
+@njit(cache=True, nogil=True)
+def add_weights(count, row, slopes, x, x_at, x_step, sums):
+    """Add the gradient of a layer's weights, from a block's slopes and inputs, to sums."""
+    block, one, plain = np.int64(BLOCK), np.int64(1), np.int64(PLAIN)
+    at, step, grad_at = row[HIDDEN], row[OUT_PAD], row[GRAD_WEIGHT]
+    if row[OUT] <= FEW:
+        for i in range(count):
+            line = x[x_at + i * x_step : x_at + i * x_step + row[IN]]
+            for k in range(row[OUT]):
+                slope = slopes[at + i * step + k]
+                total = sums[grad_at + k * row[IN_PAD] : grad_at + (k + 1) * row[IN_PAD]]
+                for j in range(len(line)):
+                    total[j] += slope * line[j]
+    elif row[TURNED]:
+        multiply(row[IN], row[OUT], block, plain, sums, grad_at, step,
+                 sums, grad_at, step, x, x_at, one, x_step,
+                 slopes, at, step, slopes, at, step)  # fmt: skip
+    else:
+        multiply(row[OUT], row[IN], block, plain, sums, grad_at, row[IN_PAD],
+                 sums, grad_at, row[IN_PAD], slopes, at, one, step,
+                 x, x_at, x_step, x, x_at, x_step)  # fmt: skip
 
 
 @njit(cache=True, nogil=True)

@@ -23,7 +23,6 @@ from .mlp import (
     BLOCK,
     CHUNK,
     GRAD_BIAS,
-    GRAD_WEIGHT,
     HIDDEN,
     IN,
     IN_PAD,
@@ -32,6 +31,7 @@ from .mlp import (
     PARTS,
     add_group_rows,
     add_rows,
+    add_weights,
     array_of,
     group_spans,
     pack,
@@ -44,7 +44,6 @@ from .mlp import (
 from .threads import run_chunks
 from .tiles import LANES, MASKED, PLAIN, ROWS, multiply
 
-_FEW = 3  # outputs of a layer
 _OPTIONS: dict[str, Any] = {
     "cache": True,
     "nogil": True,
@@ -300,37 +299,18 @@ def _forward(start, stop, samples, numbers, density, offset, colour, geometry, s
 
 
 @njit(**_OPTIONS)
-def _add_products(count, row, slopes, work, in_at, sums):
-    """The gradient of the weights of a layer of few outputs, of which a product's tiles, rows of
-    them, would be mostly surplus."""
-    at, step, in_step, grad_at = row[HIDDEN], row[OUT_PAD], row[IN_PAD], row[GRAD_WEIGHT]
-    for i in range(count):
-        line = work[in_at + i * in_step : in_at + (i + 1) * in_step]
-        for k in range(row[OUT]):
-            slope = slopes[at + i * step + k]
-            total = sums[grad_at + k * in_step : grad_at + (k + 1) * in_step]
-            for j in range(in_step):
-                total[j] += slope * line[j]
-
-
-@njit(**_OPTIONS)
 def _layers_back(count, plan, packed, work, slopes, sums, zeros):
     """From the slopes of a network's outputs to those of its first layer's, and the gradients of
     weights and biases on the way, but for the first weight's."""
     zero, one, block = np.int64(0), np.int64(1), np.int64(BLOCK)
-    plain, masked = np.int64(PLAIN), np.int64(MASKED)
+    masked = np.int64(MASKED)
     for layer in range(len(plan) - 1, -1, -1):
         row = plan[layer]
         at, step, in_step = row[HIDDEN], row[OUT_PAD], row[IN_PAD]
         add_rows(slopes, at, step, count, sums, row[GRAD_BIAS])
         if layer > 0:
-            in_at, grad_at = plan[layer - 1, HIDDEN], row[GRAD_WEIGHT]
-            if row[OUT] <= _FEW:
-                _add_products(count, row, slopes, work, in_at, sums)
-            else:
-                multiply(row[OUT], row[IN], block, plain, sums, grad_at, in_step,
-                         sums, grad_at, in_step, slopes, at, one, step,
-                         work, in_at, in_step, work, in_at, in_step)  # fmt: skip
+            in_at = plan[layer - 1, HIDDEN]
+            add_weights(count, row, slopes, work, in_at, in_step, sums)
             multiply(block, row[IN], row[OUT], masked, slopes, in_at, in_step,
                      zeros, zero, zero, slopes, at, step, one,
                      packed, row[BACKWARD], in_step, work, in_at, in_step)  # fmt: skip
@@ -341,10 +321,7 @@ def _inputs_back(row, packed, inputs, wide, slopes, sums, init, init_step, grad_
     """The first layer's part of it for offset and colour, whose inputs are the same rows."""
     zero, one, block = np.int64(0), np.int64(1), np.int64(BLOCK)
     plain, at, step, in_step = np.int64(PLAIN), row[HIDDEN], row[OUT_PAD], row[IN_PAD]
-    grad_at = row[GRAD_WEIGHT]
-    multiply(row[OUT], row[IN], block, plain, sums, grad_at, in_step,
-             sums, grad_at, in_step, slopes, at, one, step,
-             inputs, zero, wide, inputs, zero, wide)  # fmt: skip
+    add_weights(block, row, slopes, inputs, zero, wide, sums)
     multiply(block, row[IN], row[OUT], plain, grad_inputs, zero, wide,
              init, zero, init_step, slopes, at, step, one,
              packed, row[BACKWARD], in_step, inputs, zero, wide)  # fmt: skip
