@@ -45,11 +45,12 @@ def guide(
 
 def neighbourhood(grids: torch.Tensor) -> torch.Tensor:
     """The greatest value in each cell or one beside it, of grids [K, G, G, G]."""
+    grids = grids.detach()
     for axis in (1, 2, 3):
         count = grids.shape[axis] - 1
         wide = grids.clone()
         for there, here in ((1, 0), (0, 1)):
             part = wide.narrow(axis, here, count)
-            torch.maximum(part, grids.narrow(axis, there, count), out=part)
+            part.copy_(torch.maximum(part, grids.narrow(axis, there, count)))
         grids = wide
     return grids
