@@ -145,6 +145,7 @@ def test_pictures_of_a_collection_are_read_as_they_were_written(seed, width, hei
             writer.image("a", number, rgba)
             writer.labels("a", number, labels)
             writer.depth("a", number, depth)
+            writer.clip(make_clip(random, SMALL, "a", "x", False))
         clip = Path(folder) / "c/clips/a"
         file = f"{number:06d}.png"
         found = read_rgba(clip / "images" / file)

@@ -6,7 +6,7 @@ a training would draw. Both see the same samples.
 A gradient jumps where a unit's input passes 0, the log-density its limit, or a ray's depth what was
 asked of it. A sample so near to such a place that rounding puts float32 on one side and float64 on
 the other has two right answers, and one such sample can move a gradient by hundredths of its
-length: those few are counted (`decided`), held to be as near as rounding goes, and left out of both.
+length. Those few are counted (`decided`), must be as near as rounding goes, and are left out.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ GROUPS = {
 
 
 def measure(avatar: Avatar, frame: Frame, rays: int = _RAYS) -> tuple[Any, list[Claim]]:
-    """"gradients": a row a group of parameters, relative error of its gradient and each other's
+    """ "gradients": a row a group of parameters, relative error of its gradient and each other's
     largest; "sides": a row a kind of decision, how many fall otherwise and how near."""
     pixels, picked = _batch(avatar, frame, rays)
     double = copy.deepcopy(avatar.field).double()
@@ -124,15 +124,13 @@ def compared(
     for kind, right in exact.items():
         other = (ours[kind] > 0) != (right > 0)
         alike &= ~other.any(1)
-        largest = float(right.abs().max()) if right.numel() else 1.0
+        farthest = right[other].abs().max() / right.abs().max() if bool(other.any()) else 0.0
         rows.append(
             {
                 "decision": kind,
                 "numbers": right.numel(),
                 "on the other side": int(other.sum()),
-                "farthest, of the largest": float((right[other].abs().max() / largest))
-                if bool(other.any())
-                else 0.0,
+                "farthest, of the largest": float(farthest),
             }
         )
     return rows, alike
