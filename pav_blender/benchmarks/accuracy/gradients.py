@@ -25,6 +25,7 @@ from ...core.deformation import Deformer
 from ...core.evaluation.report import Claim
 from ...core.field.avatar import Avatar
 from ...core.field.field import Field, Mlp
+from ...core.field.identities import codes
 from ...core.training.batches import Picked, Pixels, Poses, draw_pixels, pick_samples
 from ...core.training.frames import Frame
 from ...core.training.losses import distortion, losses
@@ -111,8 +112,8 @@ def _batch(avatar: Avatar, frame: Frame, rays: int) -> tuple[Pixels, Picked]:
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
         visibility = Visibility(held, deformer)
-        step = avatar.config.step
-        return pixels, pick_samples(poses, pixels, visibility, avatar.config, step, generator)
+        rest = avatar.config, avatar.config.step, generator, codes(avatar)
+        return pixels, pick_samples(poses, pixels, visibility, *rest)
 
 
 def compared(
