@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import pickle
 import shutil
@@ -103,3 +104,24 @@ def test_a_step_of_many_numbers_cannot_multiply_a_head(tmp_path):
     np.savez(path, **content, shape_basis_step=np.ones((100_000, 1, 1, 1), np.float32))
     with pytest.raises(InputError, match="not one number"):
         load_head(path)
+
+
+@pytest.mark.parametrize("length", [300, 100_000])
+def test_texts_of_any_length_are_refused_in_a_line(toy_path, tmp_path, length):
+    """A name that no file can have is the name of none, and is not repeated in full."""
+    root = shutil.copytree(toy_path, tmp_path / "c")
+    path = root / "collection.json"
+    whole = json.loads(path.read_text())
+    long = "x" * length
+    for change in (
+        {"version": long},
+        {"head": {**whole["head"], "name": long}},
+        {"head": {**whole["head"], "betas": [long]}},
+        {"clips": [{**whole["clips"][0], "name": long}]},
+    ):
+        path.write_text(json.dumps(whole | change))
+        with pytest.raises(InputError) as caught:
+            read_collection(root)
+        assert str(caught.value).startswith(f"{path}: ")
+        assert len(str(caught.value)) < 1100
+        assert "\n" not in str(caught.value)

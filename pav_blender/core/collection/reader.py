@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -48,6 +49,8 @@ def read_collection(path: Path | str) -> Collection:
             for entry in meta["clips"]
         ]
         extra = dict(meta.get("extra") or {})
+    except InputError as error:
+        raise InputError(f"{meta_path}: {error}") from error
     except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
         raise InputError(f"{meta_path}: a field is missing or malformed ({error})") from error
     if not entries:
@@ -67,7 +70,7 @@ def read_collection(path: Path | str) -> Collection:
     if offset is not None:
         head = head.with_offset(offset)
     clips = [_read_clip(path, head, *entry) for entry in entries]
-    if (path / head_name).exists():  # a head file, which other folders call otherwise
+    if os.path.exists(path / head_name):  # a head file, which other folders call otherwise
         head_name = str((path / head_name).resolve())
     return Collection(path, head_name, head, betas, clips, extra, offset)
 

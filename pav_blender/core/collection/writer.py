@@ -34,7 +34,7 @@ def check_name(name: str, what: str) -> str:
 
 
 def _name_from(folder: Path, head_name: str) -> str:
-    if head_name == BUILTIN or not Path(head_name).exists():
+    if head_name == BUILTIN or not os.path.exists(head_name):
         return head_name
     try:
         return Path(os.path.relpath(Path(head_name).resolve(), folder.resolve())).as_posix()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
@@ -51,7 +52,7 @@ class Source:
         """The file of that name, with the first of the suffixes for which there is one."""
         for suffix in suffixes:
             place = self.path(f"{name}{suffix}" if isinstance(name, str) else name)
-            if place.is_file():
+            if os.path.isfile(place):  # whatever its length
                 return place
         return None
 
