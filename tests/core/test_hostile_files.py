@@ -18,7 +18,7 @@ from pav_blender.core.errors import InputError
 from pav_blender.core.files import check_folder_name
 from pav_blender.core.frame_files import clear, look
 from pav_blender.core.head import load_head, write_head
-from pav_blender.core.reading import read_arrays, read_json
+from pav_blender.core.reading import read_array, read_arrays, read_json
 
 
 def test_a_small_pickle_cannot_become_a_large_one():
@@ -125,3 +125,11 @@ def test_texts_of_any_length_are_refused_in_a_line(toy_path, tmp_path, length):
         assert str(caught.value).startswith(f"{path}: ")
         assert len(str(caught.value)) < 1100
         assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("header", ["{'shape': (3,), \x01", "{'shape': ((((", "0" * 5000, "(" * 3000])
+def test_heads_of_arrays_that_are_no_python_are_refused(tmp_path, header):
+    path = tmp_path / "a.npy"
+    path.write_bytes(b"\x93NUMPY\x01\0" + len(header).to_bytes(2, "little") + header.encode())
+    with pytest.raises(InputError, match="damaged"):
+        read_array(path)
