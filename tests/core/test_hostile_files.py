@@ -127,7 +127,9 @@ def test_texts_of_any_length_are_refused_in_a_line(toy_path, tmp_path, length):
         assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("header", ["{'shape': (3,), \x01", "{'shape': ((((", "0" * 5000, "(" * 3000])
+@pytest.mark.parametrize(
+    "header", ["{'shape': (3,), \x01", "{'shape': ((((", "0" * 5000, "(" * 3000]
+)
 def test_heads_of_arrays_that_are_no_python_are_refused(tmp_path, header):
     path = tmp_path / "a.npy"
     path.write_bytes(b"\x93NUMPY\x01\0" + len(header).to_bytes(2, "little") + header.encode())

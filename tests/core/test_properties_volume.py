@@ -6,6 +6,7 @@ from itertools import product
 
 import numpy as np
 import torch
+from fuzzing import MORE
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -14,7 +15,7 @@ from pav_blender.core.kernels.reference.encoding import PRIMES, Layout
 
 KERNELS = {"cpu": select("cpu"), "reference": select("cpu", reference=True)}
 KIND = st.sampled_from(sorted(KERNELS))
-FEW = settings(max_examples=25, deadline=None, derandomize=True)
+FEW = settings(max_examples=25 * MORE, deadline=None, derandomize=True)
 
 seeds = st.integers(0, 2**32 - 1)
 
