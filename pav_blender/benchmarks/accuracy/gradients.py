@@ -5,8 +5,8 @@ a training would draw. Both see the same samples.
 
 A gradient jumps where a unit's input passes 0, the log-density its limit, or a ray's depth what was
 asked of it. A sample so near to such a place that rounding puts float32 on one side and float64 on
-the other has two right answers, and one such sample can move a gradient by hundredths of its
-length. Those few are counted (`decided`), must be as near as rounding goes, and are left out.
+the other has two right answers, and one such sample can move a gradient by far more than rounding
+does. Those few are counted (`decided`), must be as near as rounding goes, and are left out.
 """
 
 from __future__ import annotations
