@@ -18,6 +18,7 @@ from pav_blender.core.errors import InputError
 from pav_blender.core.files import check_folder_name
 from pav_blender.core.frame_files import clear, look
 from pav_blender.core.head import load_head, write_head
+from pav_blender.core.head.flame_parts import read_eyelids
 from pav_blender.core.reading import read_array, read_arrays, read_json
 
 
@@ -135,3 +136,13 @@ def test_heads_of_arrays_that_are_no_python_are_refused(tmp_path, header):
     path.write_bytes(b"\x93NUMPY\x01\0" + len(header).to_bytes(2, "little") + header.encode())
     with pytest.raises(InputError, match="damaged"):
         read_array(path)
+
+
+@pytest.mark.parametrize("shape", [(3, 7, 1), (7, 1, 3), (2, 7, 3), (21,), (7, 4)])
+def test_eyelids_of_another_shape_are_refused(tmp_path, shape):
+    path = tmp_path / "l_eyelid.npy"
+    np.save(path, np.zeros((1, 7, 3), np.float32))
+    assert read_eyelids(path, 7).shape == (7, 3)
+    np.save(path, np.zeros(shape, np.float32))
+    with pytest.raises(InputError, match="eyelid is"):
+        read_eyelids(path, 7)
