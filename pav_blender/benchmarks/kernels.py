@@ -72,11 +72,13 @@ def _rates(repeats: int) -> dict[str, float]:
             },
             repeats + 2,
         )
-    return {
-        "multiply_adds_per_ns": round(_SIDE**3 / seconds["product"] * 1e-9, 2),
-        "bytes_per_ns": round(8 * _COPY / seconds["copy"] * 1e-9, 2),
-        "exponentials_per_ns": round(_N / seconds["exponential"] * 1e-9, 2),
+    rates = {
+        "multiply_adds_per_ns": _SIDE**3 / seconds["product"],
+        "bytes_per_ns": 8 * _COPY / seconds["copy"],
+        "exponentials_per_ns": _N / seconds["exponential"],
     }
+    # digits, not places: on a busy machine a rate may be next to nothing, and is divided by
+    return {name: float(f"{rate * 1e-9:.3g}") for name, rate in rates.items()}
 
 
 def _kernels(

@@ -10,6 +10,7 @@ from ..core.deformation import Deformer
 from ..core.deformation.rigid import stance
 from ..core.field.avatar import Avatar
 from ..core.field.field import condition
+from ..core.field.identities import code
 from ..core.kernels.cpu.threads import torch_alone
 from ..core.rendering.cameras import Camera
 from ..core.rendering.rays import camera_rays, pack, samples_of
@@ -44,7 +45,7 @@ def quadrature(
         )
         mesh, space = deformer.pose(vertices), space_of(avatar, appearance)
         stands = stance(avatar.canonical_vertices, vertices, avatar.rigid_weights)
-        seen = condition(avatar.config, expression, stands.turn)
+        seen = condition(avatar.config, expression, stands.turn, code(avatar, appearance))
         worn = avatar.field.wearing([appearance])
         ops = kernels.select("cpu").marching
         found = []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 from pathlib import Path
 from types import ModuleType
@@ -129,10 +130,15 @@ def check(path: Path | str) -> None:
 
 
 def read_metadata(path: Path | str) -> dict[str, str]:
-    """The texts that a picture carries, by name. InputError where its head cannot be read."""
+    """The texts that a picture carries, by name; those that are not UTF-8 are left out. InputError
+    where its head cannot be read."""
     source = _open(path)
+    found = {}
     try:
-        return {item.name: str(item.value) for item in source.spec().extra_attribs}
+        for item in source.spec().extra_attribs:
+            with contextlib.suppress(UnicodeDecodeError):
+                found[item.name] = str(item.value)
+        return found
     finally:
         source.close()
 

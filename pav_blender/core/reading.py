@@ -7,6 +7,7 @@ import json
 import math
 import stat
 import struct
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterable
@@ -26,7 +27,7 @@ _CHUNK = 8 * MIB
 # what zipfile, zlib and numpy raise at bytes that are no archive of theirs
 _DAMAGE = (
     OSError, ValueError, EOFError, KeyError, IndexError, TypeError, OverflowError, MemoryError,
-    RuntimeError, SyntaxError, struct.error, zlib.error, zipfile.BadZipFile,
+    RuntimeError, SyntaxError, tokenize.TokenError, struct.error, zlib.error, zipfile.BadZipFile,
 )  # fmt: skip
 
 

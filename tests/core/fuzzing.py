@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).resolve().parent
+MORE = 10 if os.environ.get("PAV_SLOW") else 1  # examples of property tests in `make test-all`
 ROOM = 1200  # MiB that damaged files may take beyond what a whole one takes
 SECONDS = 20.0  # of the processor, for one file
 

@@ -61,10 +61,12 @@ def test_a_folder_that_is_no_collection_is_never_replaced(tmp_path):
 
 @pytest.mark.parametrize("name", ["../up", "", "a/b", ".hidden", "x" * 65, "a\n"])
 def test_names_that_leave_the_folder_are_refused(tmp_path, name):
-    with CollectionWriter(tmp_path / "c", "builtin", np.zeros(2)) as writer:
-        with pytest.raises(InputError, match="clip name"):
-            writer.image(name, 0, np.zeros((4, 4, 4), np.uint8))
-        writer.root.mkdir(exist_ok=True)
+    with (
+        pytest.raises(InputError, match="clip name"),
+        CollectionWriter(tmp_path / "c", "builtin", np.zeros(2)) as writer,
+    ):
+        writer.image(name, 0, np.zeros((4, 4, 4), np.uint8))
+    assert not any(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(
@@ -84,6 +86,54 @@ def test_bad_arrays_are_named(copy, changes, words):
     with pytest.raises(InputError, match=words) as caught:
         read_collection(copy)
     assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"translation": np.full((8, 3), np.inf)}, "'translation' is not finite at frame 0"),
+        ({"pose": np.full((8, 5, 3), 1e39)}, "'pose' is not finite"),
+        ({"intrinsics": np.eye(3)}, r"'intrinsics' has shape \(3, 3\), expected \(8, 3, 3\)"),
+        ({"expression": np.zeros((7, 52))}, r"expected \(8, any\)"),
+        ({"frame_id": np.array([0, 1, 2, 3, 4, 5, 6, 6])}, "different numbers"),
+        ({"frame_id": np.arange(8) - 1}, "different numbers"),
+        ({"frame_id": np.arange(8) + 2**31}, "beyond 2147483647"),
+        ({"frame_id": np.arange(8) + 0.5}, "float64, which it cannot"),
+        ({"split": np.array(["train"] * 7 + ["holidays_abroad"])}, "unknown split"),
+        ({"width": 0}, "picture size of 0x64"),
+        ({"name": "bushy"}, "two clips have the same name"),
+        ({"appearance": ".."}, "appearance"),
+    ],
+)
+def test_what_would_not_be_read_is_not_written(toy, tmp_path, changes, words):
+    def write():
+        with CollectionWriter(tmp_path / "c", "builtin", toy.betas) as writer:
+            writer.clip(toy.clip("bushy"))
+            writer.clip(dataclasses.replace(toy.clip("plain"), **changes))
+
+    with pytest.raises(InputError, match=words) as caught:
+        write()
+    assert "\n" not in str(caught.value)
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("betas", "offset", "words"),
+    [
+        ([0.0, np.nan], None, "coefficients that are not finite"),
+        ([1e39], None, "coefficients that are not finite"),
+        ([0.0], np.full((9, 3), np.inf), "offset"),
+        ([0.0], np.zeros(9), "offset"),
+        ([0.0], None, "needs a clip"),
+    ],
+)
+def test_a_person_that_would_not_be_read_is_not_written(tmp_path, betas, offset, words):
+    with (
+        pytest.raises(InputError, match=words),
+        CollectionWriter(tmp_path / "c", "builtin", np.array(betas), offset=offset),
+    ):
+        pass
+    assert not any(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("part", [0.0, 0.001, 0.1, 0.9])

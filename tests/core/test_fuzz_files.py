@@ -208,7 +208,7 @@ OFTEN = {("vhap", "npz"), ("imavatar", "json"), ("metrical", "zip")}
     ],
 )  # fmt: skip
 def test_other_programs_folders(name, file, kind, folder, place, make):
-    root = folder / f"{name}-{Path(file).stem}" / "source"
+    root = folder / f"{name}-{Path(file).name}" / "source"
     make(WRITERS[name][0], root)
     (root.parent / "format.txt").write_text(name)
     fuzz(root / file, "source", kind, 400 if MANY else 12, place, named=False)

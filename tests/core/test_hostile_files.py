@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import pickle
 import shutil
@@ -17,7 +18,8 @@ from pav_blender.core.errors import InputError
 from pav_blender.core.files import check_folder_name
 from pav_blender.core.frame_files import clear, look
 from pav_blender.core.head import load_head, write_head
-from pav_blender.core.reading import read_arrays, read_json
+from pav_blender.core.head.flame_parts import read_eyelids
+from pav_blender.core.reading import read_array, read_arrays, read_json
 
 
 def test_a_small_pickle_cannot_become_a_large_one():
@@ -103,3 +105,44 @@ def test_a_step_of_many_numbers_cannot_multiply_a_head(tmp_path):
     np.savez(path, **content, shape_basis_step=np.ones((100_000, 1, 1, 1), np.float32))
     with pytest.raises(InputError, match="not one number"):
         load_head(path)
+
+
+@pytest.mark.parametrize("length", [300, 100_000])
+def test_texts_of_any_length_are_refused_in_a_line(toy_path, tmp_path, length):
+    """A name that no file can have is the name of none, and is not repeated in full."""
+    root = shutil.copytree(toy_path, tmp_path / "c")
+    path = root / "collection.json"
+    whole = json.loads(path.read_text())
+    long = "x" * length
+    for change in (
+        {"version": long},
+        {"head": {**whole["head"], "name": long}},
+        {"head": {**whole["head"], "betas": [long]}},
+        {"clips": [{**whole["clips"][0], "name": long}]},
+    ):
+        path.write_text(json.dumps(whole | change))
+        with pytest.raises(InputError) as caught:
+            read_collection(root)
+        assert str(caught.value).startswith(f"{path}: ")
+        assert len(str(caught.value)) < 1100
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "header", ["{'shape': (3,), \x01", "{'shape': ((((", "0" * 5000, "(" * 3000]
+)
+def test_heads_of_arrays_that_are_no_python_are_refused(tmp_path, header):
+    path = tmp_path / "a.npy"
+    path.write_bytes(b"\x93NUMPY\x01\0" + len(header).to_bytes(2, "little") + header.encode())
+    with pytest.raises(InputError, match="damaged"):
+        read_array(path)
+
+
+@pytest.mark.parametrize("shape", [(3, 7, 1), (7, 1, 3), (2, 7, 3), (21,), (7, 4)])
+def test_eyelids_of_another_shape_are_refused(tmp_path, shape):
+    path = tmp_path / "l_eyelid.npy"
+    np.save(path, np.zeros((1, 7, 3), np.float32))
+    assert read_eyelids(path, 7).shape == (7, 3)
+    np.save(path, np.zeros(shape, np.float32))
+    with pytest.raises(InputError, match="eyelid is"):
+        read_eyelids(path, 7)

@@ -9,6 +9,9 @@ import pytest
 import torch
 from toy import make_toy
 
+from pav_blender.benchmarks.accuracy import gradients, steps
+from pav_blender.benchmarks.accuracy.exact import Exact, some_rays
+from pav_blender.benchmarks.plain import quadrature
 from pav_blender.cli import main
 from pav_blender.core.baking.bake import neutral_scene
 from pav_blender.core.errors import Cancelled, InputError, OtherPerson
@@ -315,3 +318,25 @@ def test_the_verb_takes_one_collection_or_several_people(folders, tmp_path, caps
     assert "anna/plain, anna/bushy, ben/plain, ben/bushy" in capsys.readouterr().out
     assert main(["info", out[1]]) == 0
     assert json.loads(capsys.readouterr().out)["identities"] == IDENTITIES
+
+
+def test_plain_torch_is_told_whose_head_it_is(people, avatar):
+    frame = next(f for f in load_training_frames(people) if f.appearance == 2)
+    rays = some_rays(frame, 64, 4)
+    scene = pose_scene(avatar, frame.vertices, NAMES[2], frame.expression)
+    ours = steps.shown(scene, rays, steps.every(2e-3))
+    truth = Exact.of(avatar, frame).shown(rays, 2e-3)
+    assert truth.std() > 0.05
+    assert steps.differences(ours, truth)["psnr"] > 60
+
+    camera, pixels = frame.camera.resized(16, 16), np.array([16 * 6 + 8, 16 * 11 + 7])
+    pose = frame.vertices, frame.expression
+    plain = quadrature(avatar, *pose, 2, camera, pixels, 4e-3)
+    settings = steps.every(4e-3)
+    drawn = render(avatar, pose[0], camera, NAMES[2], settings, expression=pose[1]).rgba
+    drawn = drawn.reshape(-1, 4)[pixels]
+    assert (drawn[:, 3] > 0.5).all()
+    np.testing.assert_allclose(plain[:, :3], drawn[:, :3] * drawn[:, 3:], atol=1e-3)
+
+    claims = gradients.measure(avatar, frame, 64)[1]
+    assert all(claim.met for claim in claims), [c for c in claims if not c.met]

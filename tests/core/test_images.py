@@ -5,6 +5,7 @@ from pav_blender.core.errors import InputError
 from pav_blender.core.files import replacing
 from pav_blender.core.images import (
     read_gray,
+    read_metadata,
     read_rgba,
     read_scene_linear,
     write_exr,
@@ -87,3 +88,22 @@ def test_pixels_that_are_not_finite_are_told(tmp_path, value):
     write_exr(tmp_path / "b.exr", rgba)
     with pytest.raises(InputError, match=r"b\.exr: 2 pixels are not finite"):
         read_scene_linear(tmp_path / "b.exr")
+
+
+def test_texts_that_are_not_utf_8_are_left_out(tmp_path, pixels):
+    import OpenImageIO as oiio
+
+    path = tmp_path / "a.tga"
+    spec = oiio.ImageSpec(23, 17, 3, "uint8")
+    spec.attribute("Artist", "Mueller")
+    spec.attribute("Software", "Painter")
+    sink = oiio.ImageOutput.create(str(path))
+    assert sink.open(str(path), spec)
+    assert sink.write_image(pixels[..., :3])
+    sink.close()
+    assert read_metadata(path)["Artist"] == "Mueller"
+    path.write_bytes(path.read_bytes().replace(b"Mueller", b"M\xfcller\0"))
+    found = read_metadata(path)
+    assert "Artist" not in found
+    assert found["Software"].startswith("Painter")
+    np.testing.assert_array_equal(read_rgba(path)[..., :3], pixels[..., :3])

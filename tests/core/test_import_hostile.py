@@ -36,7 +36,9 @@ def first_path(key, value):
         (formats.write_imavatar, "flame_params.json", "file_path"),
     ],
 )
-@pytest.mark.parametrize("value", ["../../etc/passwd", "/etc/passwd", "C:\\x.png", "a\0b"])
+@pytest.mark.parametrize(
+    "value", ["../../etc/passwd", "/etc/passwd", "C:\\x.png", "a\0b", "\ud800"]
+)
 def test_paths_that_leave_the_source_are_refused(write, file, key, value, tmp_path, make):
     source = tmp_path / "outer" / "source"
     make(write, source)
@@ -125,6 +127,26 @@ def test_missing_pictures_are_skipped_by_name(write, tmp_path, make):
     assert len(clip.skipped) == 1
     assert "picture" in clip.skipped[0]
     assert any(digit in clip.skipped[0] for digit in "23")
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"rotation": np.float32(1)},
+        {"timestep_id": np.array("00000")},
+        {"dynamic_offset": np.float32(0)},
+        {"focal_length": np.zeros(0, np.float32)},
+    ],
+)
+def test_arrays_of_a_vhap_track_without_a_length_are_refused(changes, tmp_path, make):
+    make(formats.write_vhap_track, tmp_path / "s")
+    path = tmp_path / "s/run/tracked_flame_params_30.npz"
+    with np.load(path) as stored:
+        content = dict(stored)
+    np.savez(path, **(content | changes))
+    with pytest.raises(InputError, match=r"differ in their number|focal_length is 0") as caught:
+        read_sources([str(tmp_path / "s")])
+    assert str(path) in str(caught.value)
 
 
 def test_values_that_are_not_finite_are_skipped_by_frame(tmp_path, make):

@@ -167,12 +167,38 @@ def test_a_metric_that_lacks_something_is_absent_and_nothing_is_fetched(load, of
     )
 
 
-def test_a_package_that_does_not_load_is_absent(monkeypatch):
+def test_a_package_that_is_not_there_is_absent(monkeypatch):
     for name in ("stlpips_pytorch", "stlpips_pytorch.stlpips"):
         monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(learned.Absent) as absent:
         learned.st_lpips()
     assert absent.value.reason == "package absent"
+
+
+@pytest.mark.parametrize(
+    ("fails", "why"),
+    [
+        ("raise RuntimeError('operator torchvision::nms does not exist\\nat line 5')",
+         "torchvision: operator torchvision::nms does not exist"),
+        ("import torch; torch.library.no_such_thing",
+         "torchvision: module 'torch.library' has no attribute 'no_such_thing'"),
+        ("raise OSError('libcudart.so.13: cannot open shared object file')",
+         "torchvision: libcudart.so.13: cannot open shared object file"),
+    ],
+)  # fmt: skip
+def test_a_package_that_does_not_load_is_not_called_absent(fails, why, offline, monkeypatch):
+    """As PyPI's torchvision beside another torch: with the weights at hand."""
+    (offline / "torchvision").mkdir()
+    (offline / "torchvision" / "__init__.py").write_text(fails)
+    monkeypatch.syspath_prepend(str(offline))
+    for name in [n for n in sys.modules if n.partition(".")[0] == "torchvision"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: name)
+    monkeypatch.setattr(learned, "read", lambda file, path: {})
+    (offline / learned.ALEXNET.name).write_bytes(b"")
+    with pytest.raises(learned.Absent) as absent:
+        learned.lpips(offline)
+    assert (absent.value.reason, absent.value.needs) == ("package does not load", why)
 
 
 def test_weights_are_found_and_others_refused(offline):

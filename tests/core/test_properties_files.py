@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import safetensors.torch
 import torch
+from fuzzing import MORE
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -25,7 +26,7 @@ from pav_blender.core.head import read_head, write_head
 from pav_blender.core.head.livelink import ARKIT_NAMES, pose_of, read_take, resample
 from pav_blender.core.images import read_gray, read_rgba
 
-FEW = settings(max_examples=20, deadline=None, derandomize=True)
+FEW = settings(max_examples=20 * MORE, deadline=None, derandomize=True)
 
 seeds = st.integers(0, 2**32 - 1)
 names = st.from_regex(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}", fullmatch=True)
@@ -145,6 +146,7 @@ def test_pictures_of_a_collection_are_read_as_they_were_written(seed, width, hei
             writer.image("a", number, rgba)
             writer.labels("a", number, labels)
             writer.depth("a", number, depth)
+            writer.clip(make_clip(random, SMALL, "a", "x", False))
         clip = Path(folder) / "c/clips/a"
         file = f"{number:06d}.png"
         found = read_rgba(clip / "images" / file)
@@ -401,7 +403,7 @@ def damaged(path, data, shaped):
     return key, how
 
 
-@settings(FEW, max_examples=60)
+@settings(FEW, max_examples=60 * MORE)
 @given(st.data(), seeds)
 def test_damaged_frames_are_an_input_error_or_numbers(data, seed):
     clip = make_clip(np.random.default_rng(seed), SMALL, "a", "a", True)
@@ -427,7 +429,7 @@ def test_damaged_frames_are_an_input_error_or_numbers(data, seed):
     assert len(np.unique(read.frame_id)) == len(read)
 
 
-@settings(FEW, max_examples=60)
+@settings(FEW, max_examples=60 * MORE)
 @given(st.data())
 def test_damaged_heads_are_an_input_error_or_heads(data):
     with tempfile.TemporaryDirectory() as folder:
@@ -446,7 +448,7 @@ def test_damaged_heads_are_an_input_error_or_heads(data):
     assert head.regions["face"].dtype == bool
 
 
-@settings(FEW, max_examples=60)
+@settings(FEW, max_examples=60 * MORE)
 @given(st.data(), avatars())
 def test_damaged_avatars_are_an_input_error_or_avatars(data, made):
     with tempfile.TemporaryDirectory() as folder:

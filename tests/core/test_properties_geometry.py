@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from fuzzing import MORE
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -23,7 +24,7 @@ from pav_blender.core.rendering.cameras import Camera
 KERNELS = {"cpu": select("cpu").nearest, "reference": select("cpu", reference=True).nearest}
 KIND = st.sampled_from(sorted(KERNELS))
 MODE = st.sampled_from(["rigid", "affine", "smooth"])
-FEW = settings(max_examples=25, deadline=None, derandomize=True)
+FEW = settings(max_examples=25 * MORE, deadline=None, derandomize=True)
 
 seeds = st.integers(0, 2**32 - 1)
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 from itertools import product
 
 import numpy as np
+import pytest
 import torch
+from fuzzing import MORE
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -14,7 +16,7 @@ from pav_blender.core.kernels.reference.encoding import PRIMES, Layout
 
 KERNELS = {"cpu": select("cpu"), "reference": select("cpu", reference=True)}
 KIND = st.sampled_from(sorted(KERNELS))
-FEW = settings(max_examples=25, deadline=None, derandomize=True)
+FEW = settings(max_examples=25 * MORE, deadline=None, derandomize=True)
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -247,6 +249,15 @@ def test_transmittance_only_falls(samples, kind):
         torch.testing.assert_close((before - left).double(), spent, rtol=0, atol=1e-6)
     torch.testing.assert_close(found, weights, rtol=1e-5, atol=1e-6)
     torch.testing.assert_close(left, 1 - opacity, rtol=0, atol=2e-6)
+
+
+@pytest.mark.parametrize("kind", KERNELS)
+def test_a_solid_sample_weighs_what_is_left_before_it(kind):
+    sigma, length = torch.tensor([1.0, 1e5]), torch.full((2,), 0.1)
+    ray = torch.zeros(2, dtype=torch.int32)
+    weights = composited(kind, sigma, torch.ones(2, 3), torch.tensor([0.1, 0.2]), length, ray, 1)[3]
+    exact = -np.expm1(-0.1), np.exp(-0.1)
+    np.testing.assert_allclose(weights.numpy(), exact, rtol=0, atol=1e-7)
 
 
 @FEW

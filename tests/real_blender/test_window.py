@@ -21,7 +21,7 @@ def test_a_user_in_a_hurry(files):
         pytest.skip("set BLENDER_WINDOW to a Blender command that opens a window")
     answer = WORK / "answer.json"
     done = RealBlender(command)(
-        files / "walk.blend", "--python", HERE / "in_window.py", "--", answer, 500, timeout=700
+        files / "walk.blend", "--python", HERE / "in_window.py", "--", answer, 1500, timeout=1700
     )
     said = done.stdout + done.stderr
     assert done.returncode == 0, said

@@ -18,6 +18,7 @@ from ...core.deformation.frames import vertex_maps
 from ...core.deformation.rigid import stance
 from ...core.field.avatar import Avatar
 from ...core.field.field import Field, Samples, Worn, condition
+from ...core.field.identities import code
 from ...core.kernels import cpu, reference
 from ...core.kernels.structures import Clearance, PosedMesh
 from ...core.rendering.rays import TILE, RayBatch, camera_rays
@@ -76,7 +77,8 @@ class Exact:
         )
         unit, scale = self.space.box_min, self.space.box_scale
         zeros = torch.zeros(int(kept.sum()), dtype=torch.int32)
-        seen = condition(self.avatar.config, self.frame.expression, stands.turn).double()
+        person = code(self.avatar, self.frame.appearance)
+        seen = condition(self.avatar.config, self.frame.expression, stands.turn, person).double()
         samples = Samples(
             (canonical[kept] - unit) * scale,
             (points[kept] @ shoulders + offset - unit) * scale,

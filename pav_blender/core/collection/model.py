@@ -31,6 +31,12 @@ LABELS = (
 # train: learned from; test: held-out frames; view: held-out cameras
 SPLITS = ("train", "test", "view")
 
+# of a clip, in its frames.npz; the last two only where there are any
+ARRAYS = (
+    "expression", "pose", "translation", "intrinsics", "camera_to_world", "frame_id", "split",
+    "vertices", "landmarks",
+)  # fmt: skip
+
 
 @dataclass(eq=False)
 class Clip:

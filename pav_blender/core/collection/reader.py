@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -10,14 +11,9 @@ from ..errors import InputError
 from ..files import check_folder_name
 from ..head import HeadModel, load_head
 from ..reading import read_arrays, read_json
-from .model import FORMAT, SPLITS, VERSION, Clip, Collection
+from .checks import check_size, checked_frames, finite
+from .model import ARRAYS, FORMAT, VERSION, Clip, Collection
 from .writer import OFFSET_FILE, check_name
-
-_LARGEST_SIDE = 16384
-_ARRAYS = (
-    "expression", "pose", "translation", "intrinsics", "camera_to_world", "frame_id", "split",
-    "vertices", "landmarks",
-)  # fmt: skip
 
 
 def read_collection(path: Path | str) -> Collection:
@@ -53,6 +49,8 @@ def read_collection(path: Path | str) -> Collection:
             for entry in meta["clips"]
         ]
         extra = dict(meta.get("extra") or {})
+    except InputError as error:
+        raise InputError(f"{meta_path}: {error}") from error
     except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
         raise InputError(f"{meta_path}: a field is missing or malformed ({error})") from error
     if not entries:
@@ -72,7 +70,7 @@ def read_collection(path: Path | str) -> Collection:
     if offset is not None:
         head = head.with_offset(offset)
     clips = [_read_clip(path, head, *entry) for entry in entries]
-    if (path / head_name).exists():  # a head file, which other folders call otherwise
+    if os.path.exists(path / head_name):  # a head file, which other folders call otherwise
         head_name = str((path / head_name).resolve())
     return Collection(path, head_name, head, betas, clips, extra, offset)
 
@@ -80,80 +78,26 @@ def read_collection(path: Path | str) -> Collection:
 def _read_offset(root: Path, head: HeadModel) -> np.ndarray:
     path = root / OFFSET_FILE
     offset = read_arrays(path, ["offset"]).get("offset")
-    if offset is None or offset.shape != head.template.shape or not _finite(offset).all():
+    if offset is None or offset.shape != head.template.shape or not finite(offset).all():
         raise InputError(f"{path}: 'offset' must hold {head.template.shape} finite numbers")
     return np.asarray(offset, np.float32)
-
-
-def _finite(array: np.ndarray) -> np.ndarray:
-    """Where an array's values are numbers that stay finite as float32."""
-    if array.dtype.kind not in "iuf":
-        return np.zeros(array.shape, bool)
-    with np.errstate(over="ignore"):
-        return np.isfinite(array.astype(np.float32))
 
 
 def _read_clip(
     root: Path, head: HeadModel, name: str, appearance: str, width: int, height: int
 ) -> Clip:
     path = root / "clips" / name / "frames.npz"
-    if not (0 < width <= _LARGEST_SIDE and 0 < height <= _LARGEST_SIDE):
-        raise InputError(f"{root}: clip {name}: a picture size of {width}x{height}")
+    check_size(root, name, width, height)
     if not path.resolve().is_relative_to(root.resolve()):
         raise InputError(f"{path}: a link that leads out of the collection; nothing there is read")
     if not path.exists():
         raise InputError(f"{path}: no such file; the collection is incomplete")
-    arrays = read_arrays(path, _ARRAYS)
-    count = np.size(arrays.get("frame_id", ()))
-    if count == 0:
-        raise InputError(f"{path}: the clip has no frames (no 'frame_id')")
-    joints, vertices = len(head.joint_names), len(head.template)
-    shapes = {
-        "expression": (count, len(head.expression_basis)),
-        "pose": (count, joints, 3),
-        "translation": (count, 3),
-        "intrinsics": (count, 3, 3),
-        "camera_to_world": (count, 4, 4),
-        "frame_id": (count,),
-        "split": (count,),
-    }
-    if "vertices" in arrays:
-        shapes["vertices"] = (count, vertices, 3)
-    if "landmarks" in arrays:
-        shapes["landmarks"] = (count, len(head.landmark_triangles), 2)
-    for key, shape in shapes.items():
-        if key not in arrays:
-            raise InputError(f"{path}: the array {key!r} is missing")
-        if arrays[key].shape != shape:
-            raise InputError(f"{path}: {key!r} has shape {arrays[key].shape}, expected {shape}")
-        kinds = {"frame_id": "iu", "split": "U"}.get(key, "iuf")
-        if arrays[key].dtype.kind not in kinds:
-            raise InputError(f"{path}: {key!r} holds {arrays[key].dtype}, which it cannot")
-        if kinds == "iuf":
-            bad = ~_finite(arrays[key]).reshape(count, -1).all(axis=1)
-            if bad.any():
-                frame = arrays["frame_id"][np.flatnonzero(bad)[0]]
-                raise InputError(f"{path}: {key!r} is not finite at frame {frame}")
-            arrays[key] = np.ascontiguousarray(arrays[key], np.float32)
-    if (arrays["frame_id"] > np.iinfo(np.int32).max).any():
-        raise InputError(f"{path}: 'frame_id' has numbers beyond 2147483647")
-    if len(np.unique(arrays["frame_id"])) < count or (arrays["frame_id"] < 0).any():
-        raise InputError(f"{path}: 'frame_id' must hold different numbers from 0 up")
-    unknown = sorted(set(np.unique(arrays["split"]).tolist()) - set(SPLITS))
-    if unknown:
-        raise InputError(f"{path}: unknown split {unknown}; use {', '.join(SPLITS)}")
-    return Clip(
-        name=name,
-        appearance=appearance,
-        width=width,
-        height=height,
-        expression=arrays["expression"],
-        pose=arrays["pose"],
-        translation=arrays["translation"],
-        intrinsics=arrays["intrinsics"],
-        camera_to_world=arrays["camera_to_world"],
-        frame_id=arrays["frame_id"].astype(np.int32),
-        split=arrays["split"],
-        vertices=arrays.get("vertices"),
-        landmarks=arrays.get("landmarks"),
+    arrays = checked_frames(
+        path,
+        read_arrays(path, ARRAYS),
+        len(head.expression_basis),
+        len(head.joint_names),
+        len(head.template),
+        len(head.landmark_triangles),
     )
+    return Clip(name, appearance, width, height, **arrays)

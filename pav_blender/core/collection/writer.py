@@ -16,7 +16,8 @@ from ..errors import InputError
 from ..files import check_folder_name, replacing, write_text
 from ..head.builtin import BUILTIN
 from ..images import write_gray, write_rgba
-from .model import FORMAT, SPLITS, VERSION, Clip
+from .checks import check_size, checked_frames, finite
+from .model import ARRAYS, FORMAT, VERSION, Clip
 
 OFFSET_FILE = "head_offset.npz"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
@@ -33,7 +34,7 @@ def check_name(name: str, what: str) -> str:
 
 
 def _name_from(folder: Path, head_name: str) -> str:
-    if head_name == BUILTIN or not Path(head_name).exists():
+    if head_name == BUILTIN or not os.path.exists(head_name):
         return head_name
     try:
         return Path(os.path.relpath(Path(head_name).resolve(), folder.resolve())).as_posix()
@@ -45,7 +46,8 @@ class CollectionWriter:
     """Context manager: `root` is the folder being written, `path` where it goes at the end.
 
     An error inside the block removes what was written. Raises InputError where `path` exists,
-    unless `overwrite` says to replace a collection (and nothing but a collection).
+    unless `overwrite` says to replace a collection (and nothing but a collection), and for what
+    `read_collection` would refuse, as far as that can be told without the head.
 
     head_name: "builtin", a head file, which is named from the collection's folder so that both may
     be moved together, or the name of a head that is found by its `fingerprint`. offset [V, 3]
@@ -67,8 +69,13 @@ class CollectionWriter:
         if self.path.exists() and not (overwrite and (self.path / "collection.json").is_file()):
             what = "is not a collection" if overwrite else "exists already"
             raise InputError(f"{self.path}: {what}; choose another folder or remove it")
+        betas = np.ravel(betas)
+        if not finite(betas).all():
+            raise InputError(f"{self.path}: identity coefficients that are not finite")
+        if offset is not None and not (np.shape(offset)[1:] == (3,) and finite(offset).all()):
+            raise InputError(f"{self.path}: the offset must hold [V, 3] finite numbers")
         name = _name_from(self.path, head_name)
-        head: dict = {"name": name, "betas": [float(b) for b in np.ravel(betas)]}
+        head: dict = {"name": name, "betas": [float(b) for b in betas]}
         if fingerprint:
             head["fingerprint"] = fingerprint
         if offset is not None:
@@ -99,8 +106,10 @@ class CollectionWriter:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        if kind is not None:
+        if kind is not None or not self._meta["clips"]:
             shutil.rmtree(self.root, ignore_errors=True)
+            if kind is None:
+                raise InputError(f"{self.path}: a collection needs a clip; nothing was written")
             return
         if self._offset is not None:
             np.savez_compressed(self.root / OFFSET_FILE, offset=np.asarray(self._offset, "f4"))
@@ -128,22 +137,13 @@ class CollectionWriter:
         """Writes frames.npz and registers the clip."""
         check_name(clip.name, "clip name")
         check_folder_name(clip.appearance, "appearance")
-        unknown = set(np.unique(clip.split)) - set(SPLITS)
-        if unknown:
-            raise InputError(f"clip {clip.name}: unknown split {sorted(unknown)}; use {SPLITS}")
-        arrays = {
-            "expression": np.asarray(clip.expression, np.float32),
-            "pose": np.asarray(clip.pose, np.float32),
-            "translation": np.asarray(clip.translation, np.float32),
-            "intrinsics": np.asarray(clip.intrinsics, np.float32),
-            "camera_to_world": np.asarray(clip.camera_to_world, np.float32),
-            "frame_id": np.asarray(clip.frame_id, np.int32),
-            "split": np.asarray(clip.split, "<U8"),
-        }
-        if clip.vertices is not None:
-            arrays["vertices"] = np.asarray(clip.vertices, np.float32)
-        if clip.landmarks is not None:
-            arrays["landmarks"] = np.asarray(clip.landmarks, np.float32)
+        where = f"{self.path}: clip {clip.name}"
+        if clip.name in [known["name"] for known in self._meta["clips"]]:
+            raise InputError(f"{where}: two clips have the same name")
+        check_size(self.path, clip.name, clip.width, clip.height)
+        arrays = {name: getattr(clip, name) for name in ARRAYS}
+        arrays = {name: np.asarray(array) for name, array in arrays.items() if array is not None}
+        arrays = checked_frames(where, arrays)
         folder = self.root / "clips" / clip.name
         folder.mkdir(parents=True, exist_ok=True)
         with replacing(folder / "frames.npz") as temporary, open(temporary, "wb") as stream:

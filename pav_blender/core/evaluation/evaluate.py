@@ -61,9 +61,9 @@ _COMPARED: dict[str, Callable[[Path | None], learned.Compare]] = {
 class Evaluation:
     """rows: a dict a frame: frame ("clip/number"), appearance, split, and a value for each metric
     that was there, FID excepted, and for `fog` and `holes`. absent: by key, why a metric was not
-    ("weights absent", "package absent"); needs: by key, what to bring. scores: frames with their
-    pictures, as many as were asked for. left_out: appearances of the collection that the avatar
-    does not have. features: what FID compares, ([N, D] ours, [N, D] true), a row each of `rows`.
+    (`learned.Absent`); needs: by key, what to bring. scores: frames with their pictures, as many as
+    were asked for. left_out: appearances of the collection that the avatar does not have. features:
+    what FID compares, ([N, D] ours, [N, D] true), a row each of `rows`.
     """
 
     rows: list[dict[str, Any]]

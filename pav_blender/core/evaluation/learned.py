@@ -23,6 +23,7 @@ import numpy as np
 import torch
 
 from ..errors import InputError
+from ..reading import first_line
 
 Compare = Callable[[np.ndarray, np.ndarray], float]  # pictures [H, W, 3] in [0, 1]
 Features = Callable[[np.ndarray], np.ndarray]  # a picture -> [D]
@@ -44,7 +45,8 @@ INCEPTION = WeightsFile("pt_inception-2015-12-05-6726825d.pth", "6726825d")
 
 
 class Absent(Exception):
-    """reason: "package absent" or "weights absent"; needs: what to bring."""
+    """reason: "package absent", "package does not load" or "weights absent"; needs: what to bring,
+    or why it does not."""
 
     def __init__(self, reason: str, needs: str) -> None:
         super().__init__(f"{reason}: {needs}")
@@ -121,9 +123,10 @@ def _package(module: str, name: str) -> Any:
         other = error.name is not None and not module.startswith(error.name)
         missing = error.name if other else name
         raise Absent("package absent", f"pip install {missing}") from error
-    except (ImportError, OSError, RuntimeError) as error:
-        # a torchvision that was built for another torch, as a rule
-        raise Absent("package absent", f"{name} does not load: {error}") from error
+    except Exception as error:
+        # a torchvision that was built for another torch, as a rule: there is no telling what it
+        # raises (a missing operator, attribute or library)
+        raise Absent("package does not load", f"{name}: {first_line(error)}") from error
 
 
 @contextlib.contextmanager

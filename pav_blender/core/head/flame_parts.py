@@ -170,7 +170,7 @@ def read_eyelids(path: Path, vertices: int) -> np.ndarray:
     if offsets.dtype.kind not in "iuf":
         raise InputError(f"{path}: it holds {offsets.dtype}, not numbers")
     offsets = np.asarray(offsets, np.float32)
-    offsets = offsets.reshape(offsets.shape[-2:]) if offsets.ndim == 3 else offsets
+    offsets = offsets[0] if offsets.ndim == 3 and len(offsets) == 1 else offsets
     if offsets.shape != (vertices, 3) or not np.isfinite(offsets).all():
         raise InputError(f"{path}: {list(offsets.shape)}; an eyelid is [{vertices}, 3], finite")
     return offsets

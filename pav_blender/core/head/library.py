@@ -35,16 +35,16 @@ def load_head(
     where its name does not. Raises InputError where the head is not found, or the one found has
     another fingerprint.
     """
-    place = Path(name_or_path)
-    if beside is not None and (beside / place).exists():
+    place = Path(name_or_path)  # `os.path` bears a name that is too long for a file, `Path` not
+    if beside is not None and os.path.exists(beside / place):
         place = beside / place
     known = preferences.read(_SECTION)
     own = str(name_or_path) == BUILTIN
     if own and (fingerprint not in known or fingerprint == builtin_head().fingerprint):
         head = builtin_head()
-    elif fingerprint in known and not (_missing(known[fingerprint]) and place.exists()):
+    elif fingerprint in known and not (_missing(known[fingerprint]) and os.path.exists(place)):
         head = _remembered(name_or_path, known[fingerprint])
-    elif fingerprint and not place.exists():
+    elif fingerprint and not os.path.exists(place):
         raise InputError(
             f"the head {str(name_or_path)!r} (fingerprint {fingerprint[:12]}) is not known on this "
             "machine; name its file once: pav import --head FILE"
@@ -86,7 +86,8 @@ def remembered_head(version: str = "", fingerprint: str = "") -> HeadModel | Non
 
 
 def _read(path: Path, flame_version: str) -> tuple[HeadModel, dict[str, str]]:
-    if not (path.is_dir() or path.is_file()):  # what else there is may keep a reader waiting
+    # what else there is may keep a reader waiting
+    if not (os.path.isdir(path) or os.path.isfile(path)):
         raise InputError(f"{str(path)!r}: no such head file")
     path = path.absolute()
     if not looks_like_flame(path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
@@ -33,7 +34,7 @@ class Source:
 
     def path(self, name: Any) -> Path:
         """Where a name of one of its files leads; the file need not exist."""
-        if not isinstance(name, str) or not name or "\0" in name:
+        if not isinstance(name, str) or not name or "\0" in name or not _encodable(name):
             raise InputError(f"{self.root}: {name!r} is not a file's name")
         name = name.replace("\\", "/")
         if name.startswith("/") or re.match(r"[A-Za-z]:", name):
@@ -51,7 +52,7 @@ class Source:
         """The file of that name, with the first of the suffixes for which there is one."""
         for suffix in suffixes:
             place = self.path(f"{name}{suffix}" if isinstance(name, str) else name)
-            if place.is_file():
+            if os.path.isfile(place):  # whatever its length
                 return place
         return None
 
@@ -65,6 +66,14 @@ class Source:
     def arrays(self, name: Any) -> dict[str, np.ndarray]:
         """A file of arrays (.npz); InputError where it is missing, damaged or holds objects."""
         return _read_arrays(self.path(name))
+
+
+def _encodable(name: str) -> bool:
+    try:
+        os.fsencode(name)
+    except UnicodeEncodeError:  # half a surrogate pair, which JSON may hold and no file's name
+        return False
+    return True
 
 
 def read_json(path: Path) -> dict[str, Any]:

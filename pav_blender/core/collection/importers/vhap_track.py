@@ -37,11 +37,13 @@ def read(path: Path, name: str, tell: Tell = None) -> list[ParsedClip]:
             f"{file}: a track without a focal length, made with calibrated cameras that it does "
             "not hold; import VHAP's export instead"
         )
-    count = len(content["timestep_id"])
-    if any(len(content[key]) != count for key in _FRAMES):
+    timed = [key for key in (*_FRAMES, "dynamic_offset") if key in content]
+    count = np.size(content["timestep_id"])
+    if any(np.shape(content[key])[:1] != (count,) for key in ("timestep_id", *timed)):
         raise InputError(f"{file}: its arrays differ in their number of frames")
     height, width = _size(content, file)
-    focal = float(np.ravel(numbers(content["focal_length"], (-1,), "focal_length"))[0])
+    lengths = np.ravel(numbers(content["focal_length"], (-1,), "focal_length"))
+    focal = float(lengths[0]) if len(lengths) else 0.0
     if not 0 < focal < 1e4:
         raise InputError(f"{file}: focal_length is {focal}")
     focal *= max(height, width)

@@ -147,7 +147,8 @@ def _weights(
     width = int(counts.max()) if len(index) else 0
     table = torch.zeros((rays, width), dtype=sigma.dtype, device=sigma.device)
     table = table.index_put((index, place), optical)
-    before = table.cumsum(1)[index, place] - optical
+    # what lies before a solid sample is not got by taking its own large depth off again
+    before = torch.nn.functional.pad(table.cumsum(1), (1, 0))[index, place]
     weights = transmittance[index] * torch.exp(-before) * -torch.expm1(-optical)
     return weights, transmittance * torch.exp(-table.sum(1))
 
