@@ -106,6 +106,27 @@ def test_march_matches_the_reference_where_nothing_is_leapt(mode, wave, kind):
         assert error.max() < loose  # far away, float32 wavers between two edges of a triangle
 
 
+@pytest.mark.parametrize("step", [5e-5, 1e-3])
+@pytest.mark.parametrize("away", [0.0, 0.4, 20.0])
+def test_rays_straight_at_the_mesh_are_followed_to_their_end(away, step):
+    """The nearest point of one place bounds the search of the next: here it is the nearest point
+    of all places, so that nothing but rounding lies between that bound and the answer."""
+    vertices = POSED + np.float32(away)
+    mesh = Deformer(CANONICAL, TRIANGLES, "rigid").pose(vertices)
+    corners = torch.from_numpy(vertices)[torch.from_numpy(TRIANGLES).long()]
+    normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    directions = torch.nn.functional.normalize(normals, dim=1)  # towards the inside
+    origins = corners.mean(1) - 0.02 * directions
+    count = len(origins)
+    first = torch.zeros(count, dtype=torch.int32)
+    last = torch.full((count,), round(0.024 / step), dtype=torch.int32)
+    wave = CPU.march(
+        mesh, origins, directions, first, last, torch.zeros(count), step,
+        wave=int(last[0]) + 1, band=0.03,
+    )  # fmt: skip
+    assert torch.equal(wave.count, last + 1)
+
+
 @pytest.mark.parametrize("mode", ["affine", "smooth"])
 def test_leaps_pass_over_next_to_nothing(mode):
     (kernels, mesh), (reference, dense) = both(mode)

@@ -98,8 +98,10 @@ def locate(arrays, triangle_maps, vertex_maps, vertices, corners, px, py, pz, go
     py = select(going, py, splat(lane(py, some)))
     pz = select(going, pz, splat(lane(pz, some)))
     gx, gy, gz = px - load(feet, 0), py - load(feet, LANES), pz - load(feet, 2 * LANES)
-    # The last nearest point is a bound; rounding must leave it above the answer.
-    best = fma(gx, gx, fma(gy, gy, fma(gz, gz, splat(1e-12)))) * splat(1.00001)
+    # The last nearest point is a bound, d; rounding must leave it above the answer. Both are off by
+    # some roundings of the coordinates, e = 7e-7 |p| in all: (d + e)^2 <= 1.001 d^2 + 1001 e^2.
+    best = fma(gx, gx, fma(gy, gy, gz * gz)) * splat(1.001)
+    best = fma(fma(px, px, fma(py, py, pz * pz)), splat(5e-10), best)
     best = select(going, best, splat(-1.0))
     boxes, starts, records = arrays[0], arrays[1], arrays[2]
     best, found = search(boxes, starts, records, px, py, pz, best, splat_int(-1), stack, scratch)
