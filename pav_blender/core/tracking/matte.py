@@ -22,6 +22,7 @@ MASK_SIDE = 256
 _FLOOR = 0.1  # the network's edge is softer than hair is, and never quite sure
 _STILL = 4.0  # mask pixels that a head may move between frames whose masks are averaged
 _VOTERS = 24
+_UNHEARD = 0.01  # of the loudest voter's say
 _ALIKE = 0.08  # radians between turns of the head at which outlines still compare
 _HAIR = 12  # pixels of a mask that short hair may stand off the scalp
 _MISLAID = 1
@@ -105,11 +106,18 @@ def agreed(
     for row in range(len(masks)):
         away = np.linalg.norm(poses[spread] - poses[row], axis=1)
         weights = np.exp(-0.5 * (away / _ALIKE) ** 2) + 1e-6
-        maps = np.stack([_similarity(points[row], points[voter]) for voter in spread])
+        # most look elsewhere, and have no say
+        heard = np.flatnonzero(weights > _UNHEARD * weights.max())
+        weights = weights[heard]
+        maps = np.stack([_similarity(points[row], points[spread[voter]]) for voter in heard])
         grid = functional.affine_grid(
-            torch.from_numpy(maps.astype(np.float32)), list(voters.shape), align_corners=False
+            torch.from_numpy(maps.astype(np.float32)),
+            [len(heard), 1, *voters.shape[2:]],
+            align_corners=False,
         )
-        votes = functional.grid_sample(voters, grid, padding_mode="border", align_corners=False)
+        votes = functional.grid_sample(
+            voters[heard], grid, padding_mode="border", align_corners=False
+        )
         share = torch.from_numpy((weights / weights.sum()).astype(np.float32))
         mean = (votes[:, 0] * share[:, None, None]).sum(0, keepdim=True)
         # outlines laid over one another miss by some pixels: only what lies within all the same
