@@ -381,6 +381,51 @@ def test_names_splits_andranges():
     assert ranges([0, 4, 8, 16], 4) == "0-8, 16"
 
 
+class _Leaning:
+    """Sees `faces` of a picture, or of its mirror image, always somewhat to the right of where
+    they are, and smiling on the left."""
+
+    def __init__(self, faces, mirrored=False):
+        self.score_names = ("mouthSmileLeft", "mouthSmileRight", "jawOpen")
+        self._faces, self._mirrored = faces, mirrored
+        self.closed = False
+
+    def __call__(self, rgb):
+        seen = [face.copy() for face in self._faces]
+        if self._mirrored:
+            seen = [face[detectors.mirror_partners()] for face in seen]
+            for face in seen:
+                face[:, 0] = 1 - face[:, 0]
+        scores = np.array([0.8, 0.2, 0.4], np.float32)
+        return [Face(face + np.array([0.004, 0, 0], np.float32), scores) for face in seen]
+
+    def close(self):
+        self.closed = True
+
+
+def test_looking_both_ways_takes_out_what_a_detector_leans_to_a_side():
+    head = builtin_head()
+    face = (0.5 + np.asarray(head.landmarks(head.template)) * [1, -1, -1]).astype(np.float32)
+    other = face * np.float32(0.5)
+    partners = detectors.mirror_partners()
+    assert (partners[partners] == np.arange(478)).all()
+    assert partners[33] == 263  # the eyes' outer corners
+    # the mirror image shows another order of faces, and one of them not at all
+    for again, seen in (([other, face], 2), ([face], 2), ([], 2)):
+        plain, mirrored = _Leaning([face, other]), _Leaning(again, mirrored=True)
+        both = detectors.BothWays(plain, mirrored)
+        found = both(np.zeros((8, 8, 3), np.uint8))
+        assert len(found) == seen
+        centred = 0.0 if again else 0.004
+        assert np.abs(found[0].landmarks - face - np.float32([centred, 0, 0])).max() < 1e-4
+        assert found[0].scores == pytest.approx([0.5, 0.5, 0.4] if again else [0.8, 0.2, 0.4])
+        left_over = 0.0 if len(again) == 2 else 0.004
+        assert np.abs(found[1].landmarks - other - np.float32([left_over, 0, 0])).max() < 1e-4
+        both.close()
+        assert plain.closed
+        assert mirrored.closed
+
+
 # a made-up video whose head is known: the whole road without a network
 
 

@@ -49,7 +49,8 @@ def _truth(head, frames, seed, shake=1.0):
 def _seen(head, truth, *, noise, seed=0, numbers=None):
     betas, expression, pose, translation = truth
     model = LandmarkModel(head, _BETAS)
-    points = model.pose(betas, expression, pose, translation).points
+    posed = model.pose(betas, expression, pose, translation)
+    points = posed.points + model.strayed(posed)
     pixels = points[..., :2] * [FOCAL, -FOCAL] / -points[..., 2:] + SIDE / 2
     depth = -points[..., 2:] * FOCAL / AWAY
     landmarks = np.concatenate([pixels, depth - depth.mean(axis=1, keepdims=True)], axis=2)
@@ -87,9 +88,9 @@ def test_fit_finds_the_pixels_it_was_given_without_their_noise(head, fitted):
     truths, _, fit = fitted
     for truth, clip in zip(truths, fit.clips, strict=True):
         clean = _seen(head, truth, noise=0).landmarks[..., :2]
-        missed = np.linalg.norm(
-            _pixels(_points(head, fit, clip).points, clip.focal) - clean, axis=2
-        )
+        posed = _points(head, fit, clip)
+        points = posed.points + LandmarkModel(head, len(fit.betas)).strayed(posed)
+        missed = np.linalg.norm(_pixels(points, clip.focal) - clean, axis=2)
         assert np.median(missed) < 0.5
         assert np.percentile(missed, 95) < 2
 
@@ -292,7 +293,8 @@ def test_bordered_solution_is_the_dense_one(frames):
 def test_landmarks_stand_where_the_detector_sees_them(head):
     """Off the built-in head's surface by what was measured, and turning with the head."""
     offsets = np.load(OFFSETS_PATH, allow_pickle=False)
-    assert offsets.shape == (478, 3)
+    assert offsets.shape == (3, 478, 3)
+    offsets, by_side = offsets[0], offsets[1:]
     assert 1e-4 < np.linalg.norm(offsets, axis=1).mean() < 6e-3
     plain = PointModel(head, 4, head.landmark_triangles, head.landmark_barycentrics)
     pose = np.zeros((1, len(head.joint_names), 3))
@@ -305,6 +307,12 @@ def test_landmarks_stand_where_the_detector_sees_them(head):
     skull &= head.skinning_weights[plain.corners, 1].min(axis=1) > 0.999
     assert skull.sum() > 100
     assert np.abs(moved[0, skull] - turned[skull]).max() < 1e-6
+    # and by more the farther it is turned: here seen from its own right, by the sine of the turn
+    model = LandmarkModel(head, 4)
+    away = nothing[3] + (0, 0, -100)
+    posed = model.pose(*nothing[:3], away)
+    expected = -np.sin(0.5) * by_side[0] @ rotations(pose[0, 1]).T
+    assert np.abs(model.strayed(posed)[0] - expected).max() < 1e-4
     other = replace(head, landmark_triangles=np.roll(head.landmark_triangles, 1))
     assert np.abs(LandmarkModel(other, 4).rest - PointModel(
         other, 4, other.landmark_triangles, other.landmark_barycentrics

@@ -53,8 +53,8 @@ def filmed():
 
 
 def _seen(model, betas, fit, side):
-    points = model.pose(betas, fit.expression, fit.pose, fit.translation).points
-    pixels = project(points, fit.focal) + side / 2
+    posed = model.pose(betas, fit.expression, fit.pose, fit.translation)
+    pixels = project(posed.points + model.strayed(posed), fit.focal) + side / 2
     landmarks = np.concatenate([pixels, np.zeros_like(pixels[..., :1])], axis=2)
     numbers = np.arange(len(pixels), dtype=np.int32)
     return Observations(landmarks.astype(np.float32), None, (), numbers, [], side, side)
@@ -97,7 +97,7 @@ def test_pictures_leave_the_truth_alone(filmed):
     head, betas, truth, seen, pictures = filmed
     start = HeadFit(betas, [truth], [], [])
     found = refine_head(head, [seen], start, [_windows(seen, pictures)], rates=[10.0])
-    assert np.median(_turn_errors(found.clips[0], truth)) < 0.5
+    assert np.median(_turn_errors(found.clips[0], truth)) < 0.55
     shown = _seen(LandmarkModel(head, len(betas)), found.betas, found.clips[0], seen.width)
     off = np.linalg.norm(shown.landmarks - seen.landmarks, axis=2)
     assert np.median(off) < 0.7
@@ -132,6 +132,23 @@ def test_photo_slopes_are_the_costs(filmed):
             pose[0, 1, axis] += sign * step
             costs.append(term.cost(betas, replace(fit, pose=pose)))
         assert gradient[column] == pytest.approx((costs[0] - costs[1]) / (2 * step), rel=0.1)
+
+
+def test_steep_places_keep_their_say_where_skin_is_a_pixel_off(monkeypatch):
+    """A nostril a pixel off its place differs as much as a hand before a cheek; it is no hand."""
+    residual = np.random.default_rng(0).normal(0, 0.1, (6, 400))
+    steep, hidden = np.arange(400) < 40, np.arange(400) >= 360
+    residual[:, steep | hidden] = 0.6
+    gradient = np.zeros((6, 400, 2))
+    gradient[:, steep, 0] = 0.6 * 0.5  # a source pixel, of which a window's has two
+    whole = np.ones((6, 400))
+    windows = photo.Pictures(np.zeros((6, 4, 4), np.int8), np.zeros((6, 2)), np.full(6, 0.5))
+    term = Photo(None, windows, seen=whole)
+    monkeypatch.setattr(term, "_compared", lambda *_: (residual, whole > 0, gradient))
+    term.weigh(None, None)
+    plain = term.weights[:, 40:360].mean()
+    assert term.weights[:, steep].mean() > 0.5 * plain
+    assert term.weights[:, hidden].mean() < 0.1 * plain
 
 
 def test_a_hand_before_the_face_does_not_enter_the_template():

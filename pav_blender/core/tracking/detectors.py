@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import importlib
 import os
@@ -13,11 +14,13 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from ..errors import InputError
+from ..head import builtin_head
 from ..reading import MIB, read_bytes, stored_members
 
 INSTALL = "`pip install mediapipe==0.10.21` (Python 3.9 to 3.12)"
 _LARGEST_TASK = 256 * MIB
 FACES, HANDS, HAND_POINTS = 4, 2, 21  # so many at most
+_SAME_FACE = 0.1  # of a face's extent: mean distance of landmarks, seen both ways
 
 
 class Face(NamedTuple):
@@ -46,10 +49,15 @@ class HandDetector(Protocol):
 
 
 def make_detector(task_file: Path | str | None = None) -> Detector:
-    """The best detector this Python has; with a `.task` file one that scores expressions too.
+    """The best detector this Python has, looking at every picture twice; with a `.task` file one
+    that scores expressions too.
 
     Raises InputError where MediaPipe is missing, or carries no model and no file is given.
     """
+    return BothWays(_one_way(task_file), _one_way(task_file))
+
+
+def _one_way(task_file: Path | str | None) -> Detector:
     mediapipe = load_mediapipe()
     if task_file is not None:
         return _TaskDetector(mediapipe, Path(task_file))
@@ -108,8 +116,10 @@ def detector_name(task_file: Path | str | None) -> str:
     """Tells what `make_detector` makes apart from what other versions and files make."""
     version = getattr(load_mediapipe(), "__version__", "unknown")
     if task_file is None or not Path(task_file).is_file():
-        return f"mediapipe {version}"
-    return f"mediapipe {version} {hashlib.sha256(Path(task_file).read_bytes()).hexdigest()}"
+        return f"both ways, mediapipe {version}"
+    return (
+        f"both ways, mediapipe {version} {hashlib.sha256(Path(task_file).read_bytes()).hexdigest()}"
+    )
 
 
 class _Hands:
@@ -134,6 +144,72 @@ class _Hands:
 
 
 _NO_HANDS = np.zeros((0, HAND_POINTS, 2), np.float32)
+
+
+class BothWays:
+    """A detector's look at the picture and another's at its mirror image, in the mean: what the
+    network gets wrong to one side it gets wrong to the other as well.
+
+    The second has a detector of its own, for one may follow faces from picture to picture.
+    """
+
+    def __init__(self, plain: Detector, mirrored: Detector) -> None:
+        self._plain, self._mirrored = plain, mirrored
+        self.score_names: tuple[str, ...] = ()
+
+    def __call__(self, rgb: np.ndarray) -> list[Face]:
+        faces = self._plain(rgb)
+        self.score_names = self._plain.score_names
+        again = [
+            self._turned_back(face) for face in self._mirrored(np.ascontiguousarray(rgb[:, ::-1]))
+        ]
+        return [_mean(face, again) for face in faces]
+
+    def _turned_back(self, face: Face) -> Face:
+        landmarks = face.landmarks[mirror_partners()] * np.array([-1, 1, 1], np.float32)
+        landmarks[:, 0] += 1
+        if face.scores is None:
+            return Face(landmarks, None)
+        names = self._mirrored.score_names
+        return Face(landmarks, face.scores[[names.index(_other_side(n, names)) for n in names]])
+
+    def close(self) -> None:
+        self._plain.close()
+        self._mirrored.close()
+
+
+def _other_side(name: str, names: tuple[str, ...]) -> str:
+    """mouthSmileLeft -> mouthSmileRight, jawLeft -> jawRight."""
+    for one, other in (("Left", "Right"), ("Right", "Left")):
+        if name.endswith(one) and name[: -len(one)] + other in names:
+            return name[: -len(one)] + other
+    return name
+
+
+def _mean(face: Face, again: list[Face]) -> Face:
+    """Of a face and the one among `again` that lies where it does; itself where none does."""
+    if not again:
+        return face
+    places = face.landmarks[:, :2]
+    apart = [float(np.abs(other.landmarks[:, :2] - places).mean()) for other in again]
+    best = int(np.argmin(apart))
+    if apart[best] > _SAME_FACE * float(np.ptp(places, axis=0).max()):
+        return face
+    other = again[best]
+    scores = face.scores
+    if scores is not None and other.scores is not None:
+        scores = 0.5 * (scores + other.scores)
+    return Face(0.5 * (face.landmarks + other.landmarks), scores)
+
+
+@functools.cache
+def mirror_partners() -> np.ndarray:
+    """The landmark on the other side of the face for each, [478]; those of the middle are their
+    own. MediaPipe's mesh is symmetric, and so is the built-in head that carries it."""
+    head = builtin_head()
+    places = np.asarray(head.landmarks(head.template.astype(np.float64)))
+    apart = np.linalg.norm(places[:, None] - places[None] * (-1, 1, 1), axis=2)
+    return apart.argmin(axis=1)
 
 
 class _BundledDetector:

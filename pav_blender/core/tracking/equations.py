@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..kernels.cpu.threads import run_chunks
 from . import bordered, priors
 from .landmark_model import PointModel
 from .terms import ClipFit, Term
@@ -83,7 +84,13 @@ def _bends(values: np.ndarray, triples: np.ndarray) -> np.ndarray:
 
 def step(problem: Problem, betas: np.ndarray, clips: list[ClipFit]) -> list[bordered.Normal]:
     """The normal equations, a clip each; the first carries the shared unknowns' priors."""
-    normals = [_normal(problem, index, betas, clips) for index in range(len(clips))]
+    normals: list[bordered.Normal] = [None] * len(clips)  # type: ignore[list-item]
+
+    def make(start: int, stop: int) -> None:
+        for index in range(start, stop):
+            normals[index] = _normal(problem, index, betas, clips)
+
+    run_chunks(make, len(clips), 1)
     _add_shared_priors(problem, normals[0], betas, clips)
     return normals
 

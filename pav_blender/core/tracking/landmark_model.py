@@ -17,8 +17,9 @@ from ..errors import InputError
 from ..head import HeadModel, builtin_head
 from ..head.geometry import vertex_normals
 
-# where the detector sees the built-in head's landmarks: [478,3] metres from their places on the
-# surface, in the head's frame; see tools/measure_detector.py
+# where the detector sees the built-in head's landmarks: [3,478,3] metres from their places on the
+# surface, in the head's frame, seen from the front, and what comes to it with each unit of
+# `LandmarkModel.sides`; see tools/measure_detector.py
 OFFSETS_PATH = Path(__file__).parent / "data" / "mediapipe_offsets.npy"
 
 # MediaPipe's face mesh, by the numbers its documentation gives
@@ -198,10 +199,11 @@ class PointModel:
             bone = self.joint_basis[joint] - self.joint_basis[parent]
             moved.append(moved[parent] + posed.turns[:, parent] @ bone)
         shift = np.stack(moved, 1) - posed.turns @ self.joint_basis  # [F,J,3,B]
-        flat = shift.transpose(0, 3, 2, 1).reshape(len(outer), -1, self.joints)  # [F,B*3,J]
-        drift = (flat @ self.share).astype(np.float32)
-        drift = drift.reshape(len(outer), -1, 1, *outer.shape[2:])  # [F,B,1,3,L]
-        return (outer[:, None] * drift).sum(axis=3)
+        frames, rows, _, count = outer.shape
+        pulled = outer.transpose(0, 3, 1, 2)[:, :, :, None] * self.share.T[:, None, :, None]
+        pulled = pulled.astype(np.float32).reshape(frames, count * rows, -1)  # [F,L*D,J*3]
+        drift = pulled @ shift.astype(np.float32).reshape(frames, -1, self.shapes)
+        return drift.reshape(frames, count, rows, -1).transpose(0, 3, 2, 1)
 
 
 class LandmarkModel(PointModel):
@@ -216,14 +218,35 @@ class LandmarkModel(PointModel):
                 f"head {head.name!r} has no landmark embedding, which tracking needs; add one "
                 "(docs: head files) or track with the built-in head"
             )
+        offsets = np.zeros((3, len(head.landmark_triangles), 3), np.float32)
+        if _is_builtin(head):
+            offsets = np.load(OFFSETS_PATH, allow_pickle=False)
         super().__init__(
             head,
             shapes,
             head.landmark_triangles,
             head.landmark_barycentrics,
-            np.load(OFFSETS_PATH, allow_pickle=False) if _is_builtin(head) else None,
+            offsets[0],
             _INWARD,
         )
+        self.by_side = offsets[1:].astype(np.float64)
+
+    def strayed(self, posed: Posed) -> np.ndarray:
+        """How much farther than from the front the detector's points stray from where the surface
+        has them, [F,L,3] metres in the camera's frame."""
+        turn = posed.turns[:, 1 if self.joints > 1 else 0]
+        own = np.tensordot(sides(turn, posed.points), self.by_side, 1)
+        return own @ turn.transpose(0, 2, 1)
+
+
+def sides(turn: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """From where a head is looked at, [F,2]: how far from its left and from above, as sines.
+
+    turn [F,3,3] of the head, points [F,L,3] of its face; the camera stands at the origin.
+    """
+    away = -points.mean(axis=1)
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    return np.einsum("fji,fj->fi", turn, away)[:, :2]
 
 
 def _is_builtin(head: HeadModel) -> bool:

@@ -16,12 +16,14 @@ import torch
 from torch.nn import functional
 
 from ..errors import InputError
+from ..kernels.cpu.threads import run_chunks
 from .detectors import INSTALL, load_mediapipe, quiet
 
 MASK_SIDE = 256
 _FLOOR = 0.1  # the network's edge is softer than hair is, and never quite sure
 _STILL = 4.0  # mask pixels that a head may move between frames whose masks are averaged
 _VOTERS = 24
+_UNHEARD = 0.01  # of the loudest voter's say
 _ALIKE = 0.08  # radians between turns of the head at which outlines still compare
 _HAIR = 12  # pixels of a mask that short hair may stand off the scalp
 _MISLAID = 1
@@ -102,23 +104,34 @@ def agreed(
     spread = np.linspace(0, len(masks) - 1, min(len(masks), _VOTERS)).astype(int)
     voters = torch.from_numpy(masks[spread].astype(np.float32) / 255)[:, None]
     out = masks.copy()
-    for row in range(len(masks)):
-        away = np.linalg.norm(poses[spread] - poses[row], axis=1)
-        weights = np.exp(-0.5 * (away / _ALIKE) ** 2) + 1e-6
-        maps = np.stack([_similarity(points[row], points[voter]) for voter in spread])
-        grid = functional.affine_grid(
-            torch.from_numpy(maps.astype(np.float32)), list(voters.shape), align_corners=False
-        )
-        votes = functional.grid_sample(voters, grid, padding_mode="border", align_corners=False)
-        share = torch.from_numpy((weights / weights.sum()).astype(np.float32))
-        mean = (votes[:, 0] * share[:, None, None]).sum(0, keepdim=True)
-        # outlines laid over one another miss by some pixels: only what lies within all the same
-        agreed_on = -_widest(-mean, _MISLAID)[0].numpy()
-        scalp = torch.from_numpy(scalps[row].astype(np.float32) / 255)[None]
-        near = _widest(scalp, _HAIR)[0].numpy() > 0
-        sure = ((agreed_on - 0.45) / 0.4).clip(0, 1)
-        raised = np.maximum(out[row], (sure * 255 + 0.5).astype(np.uint8))
-        out[row] = np.where(near, raised, out[row])
+
+    def vote(start: int, stop: int) -> None:
+        for row in range(start, stop):
+            away = np.linalg.norm(poses[spread] - poses[row], axis=1)
+            weights = np.exp(-0.5 * (away / _ALIKE) ** 2) + 1e-6
+            # most look elsewhere, and have no say
+            heard = np.flatnonzero(weights > _UNHEARD * weights.max())
+            weights = weights[heard]
+            maps = np.stack([_similarity(points[row], points[spread[voter]]) for voter in heard])
+            grid = functional.affine_grid(
+                torch.from_numpy(maps.astype(np.float32)),
+                [len(heard), 1, *voters.shape[2:]],
+                align_corners=False,
+            )
+            votes = functional.grid_sample(
+                voters[heard], grid, padding_mode="border", align_corners=False
+            )
+            share = torch.from_numpy((weights / weights.sum()).astype(np.float32))
+            mean = (votes[:, 0] * share[:, None, None]).sum(0, keepdim=True)
+            # outlines laid over one another miss by some pixels: only what lies within all the same
+            agreed_on = -_widest(-mean, _MISLAID)[0].numpy()
+            scalp = torch.from_numpy(scalps[row].astype(np.float32) / 255)[None]
+            near = _widest(scalp, _HAIR)[0].numpy() > 0
+            sure = ((agreed_on - 0.45) / 0.4).clip(0, 1)
+            raised = np.maximum(out[row], (sure * 255 + 0.5).astype(np.uint8))
+            out[row] = np.where(near, raised, out[row])
+
+    run_chunks(vote, len(masks), 4)
     return out
 
 

@@ -19,7 +19,7 @@ from .shots import places
 # next; how many frames it may be gone
 _STEP, _GROWTH, _GONE = 0.5, 1.35, 8
 # shape distance up to which two tracks count as one person, see `apart`
-ALIKE = 0.045
+ALIKE = 0.05
 _SHAPE = tuple(sorted({*RIGID, 1, 2, 4, 5, 98, 327, 129, 358, 205, 425, 117, 346, 50, 280}))
 _LEFT, _RIGHT, _FOREHEAD, _CHIN = 234, 454, 10, 152
 _FRONTAL = 16  # so many frames of a track, the most frontal ones, give its shape

@@ -17,6 +17,9 @@ from .photo import Pictures, sample, templates, visible
 # a photo residual is this likely to be new information beside its neighbours'
 _PHOTO_INDEPENDENT = 0.1
 _FLOOR = 0.05  # of a feature's units: pictures are never alike to less than that
+# pixels of a face's window that skin may be off without counting as something else before it: where
+# a feature is steep it differs much for little, and says most
+_ASTRAY = 1.0
 
 
 @dataclass(eq=False)
@@ -81,19 +84,26 @@ def _slopes(
 
 @dataclass(eq=False)
 class Landmarks:
-    """target [F,L,2] pixels about the picture's middle, y down; trust [F,L]; scatter in pixels."""
+    """target [F,L,2] pixels about the picture's middle, y down; trust [F,L]; scatter in pixels.
+
+    `aim` [F,L,2] is the target without what the detector strays in such a turn of the head.
+    """
 
     model: LandmarkModel
     target: np.ndarray
     trust: np.ndarray
     scatter: float
     weights: np.ndarray | None = None
+    aim: np.ndarray | None = None
 
     def weigh(self, betas: np.ndarray, fit: ClipFit) -> None:
         """Trust, less for what turns away from the camera and for what fits badly."""
         posed = _posed(self.model, betas, fit)
         facing = ((self.model.facing(posed) - 0.05) / 0.4).clip(0.03, 1)
-        distance = np.linalg.norm(project(posed.points, fit.focal) - self.target, axis=2)
+        pixels = project(posed.points, fit.focal)
+        strayed = project(posed.points + self.model.strayed(posed), fit.focal)
+        self.aim = self.target - (strayed - pixels)
+        distance = np.linalg.norm(pixels - self.aim, axis=2)
         # while everything is still far off, nothing is an outlier yet
         usual = max(self.scatter, float(np.median(distance)))
         robust = 1 / (1 + (distance / (4 * usual)) ** 2)
@@ -101,25 +111,28 @@ class Landmarks:
 
     def cost(self, betas: np.ndarray, fit: ClipFit) -> float:
         assert self.weights is not None
-        missed = project(_posed(self.model, betas, fit).points, fit.focal) - self.target
+        assert self.aim is not None
+        missed = project(_posed(self.model, betas, fit).points, fit.focal) - self.aim
         return float((self.weights[..., None] * missed**2).sum())
 
     def linearised(
         self, betas: np.ndarray, fit: ClipFit, rows: slice
     ) -> tuple[np.ndarray, np.ndarray]:
         assert self.weights is not None
+        assert self.aim is not None
         posed = _posed(self.model, betas, fit, rows)
         pixels = project(posed.points, fit.focal)
         outer = project_slopes(posed.points, fit.focal)
         by_focal = pixels.transpose(0, 2, 1)
         slopes = _slopes(self.model, posed, fit.pose[rows], outer, by_focal)
         root = np.sqrt(self.weights[rows])[:, None].astype(np.float32)
-        residual = (pixels - self.target[rows]).transpose(0, 2, 1).astype(np.float32)
+        residual = (pixels - self.aim[rows]).transpose(0, 2, 1).astype(np.float32)
         return residual * root, slopes * root[:, None]
 
     def distances(self, betas: np.ndarray, fit: ClipFit) -> np.ndarray:
         """Median distance of a frame's landmarks, in pixels, [F]."""
-        missed = project(_posed(self.model, betas, fit).points, fit.focal) - self.target
+        posed = _posed(self.model, betas, fit)
+        missed = project(posed.points + self.model.strayed(posed), fit.focal) - self.target
         return np.median(np.linalg.norm(missed, axis=2), axis=1)
 
 
@@ -159,12 +172,14 @@ class Photo:
         self.template = self.template + share * apart / (1 + (apart / 0.5) ** 2)
 
     def weigh(self, betas: np.ndarray, fit: ClipFit) -> None:
-        residual, inside = self.residual(betas, fit)
+        residual, inside, gradient = self._compared(betas, fit)
         assert self.seen is not None
         base = self.seen * inside
         usual = 1.48 * float(np.median(np.abs(residual[base > 0.5]))) if (base > 0.5).any() else 1.0
         usual = max(usual, _FLOOR)
-        robust = 1 / (1 + (residual / (2 * usual)) ** 2) ** 2
+        steep = (gradient**2).sum(axis=2) / self.pictures.scale[:, None] ** 2
+        likely = usual**2 + _ASTRAY**2 * steep
+        robust = 1 / (1 + residual**2 / (4 * likely)) ** 2
         self.weights = self.weight * _PHOTO_INDEPENDENT * base * robust / usual**2
 
     def cost(self, betas: np.ndarray, fit: ClipFit) -> float:
@@ -192,10 +207,16 @@ class Photo:
 
     def residual(self, betas: np.ndarray, fit: ClipFit) -> tuple[np.ndarray, np.ndarray]:
         """What the points show more than the template [F,L], and which are in the picture."""
+        return self._compared(betas, fit)[:2]
+
+    def _compared(
+        self, betas: np.ndarray, fit: ClipFit
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """As `residual`, and the pictures' gradients [F,L,2] a source pixel."""
         assert self.template is not None
         posed = _posed(self.model, betas, fit)
-        values, _, inside = sample(self.pictures, project(posed.points, fit.focal))
-        return values - self.template, inside
+        values, gradient, inside = sample(self.pictures, project(posed.points, fit.focal))
+        return values - self.template, inside, gradient
 
 
 def with_weight(term: Landmarks, factor: float) -> Landmarks:

@@ -13,6 +13,7 @@ from ..collection import CollectionWriter
 from ..errors import InputError
 from ..head import BUILTIN, HeadModel, remember_head
 from ..head.flame import version_of
+from ..kernels.cpu.threads import torch_alone
 from ..progress import Report
 from . import detectors
 from .cache import Cache
@@ -47,6 +48,7 @@ class TrackReport:
     warnings: list[str]
 
 
+@torch_alone()
 def track(
     videos: Sequence[Path | str],
     out: Path | str,

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 
 from ..collection import Clip, CollectionWriter
 from ..errors import Cancelled, InputError
 from ..head import HeadModel
+from ..kernels.cpu.threads import run_chunks
 from ..progress import Report
 from ..rendering.cameras import Camera
 from ..rendering.rasterise import rasterise
@@ -24,6 +26,7 @@ from .terms import ClipFit
 
 ShouldStop = Callable[[], bool]
 _CHUNK = 128  # masks between two savings
+_AT_ONCE = 8  # windows in memory
 
 
 @dataclass(eq=False)
@@ -118,7 +121,12 @@ def write_pictures(
         )
         masks = _mended(masks, head, betas, clip, track)
     parts = labels.of_triangles(head)
-    for row, picture in enumerate(windows(track.shot, track.rows, work, should_stop)):
+
+    def write(some: list[tuple[int, np.ndarray]]) -> None:
+        for row, picture in some:
+            write_one(row, picture)
+
+    def write_one(row: int, picture: np.ndarray) -> None:
         if masks is None:
             rgba = np.concatenate([picture, np.ones_like(picture[..., :1])], axis=2)
         else:
@@ -128,7 +136,11 @@ def write_pictures(
         writer.image(clip.name, number, rgba)
         if masks is not None:
             writer.labels(clip.name, number, labels.label(head, parts, betas, clip, row, rgba))
-        tell(0.4 + 0.6 * row / count, step=f"writing {clip.name}")
+
+    pictures = enumerate(windows(track.shot, track.rows, work, should_stop))
+    while some := list(islice(pictures, _AT_ONCE)):
+        run_chunks(lambda i, j, some=some: write(some[i:j]), len(some), 1)
+        tell(0.4 + 0.6 * (some[-1][0] + 1) / count, step=f"writing {clip.name}")
 
 
 def _cutting(tell: Report, done: int, clip: Clip) -> None:
@@ -198,12 +210,18 @@ def _silhouettes(
     triangles = head.triangles[solid[head.triangles].all(axis=1)]
     if len(triangles) == 0:
         return masks
-    for row in range(len(clip)):
-        camera = Camera(clip.width, clip.height, clip.intrinsics[row], clip.camera_to_world[row])
-        one = slice(row, row + 1)
-        posed = head.pose(betas, clip.expression[one], clip.pose[one], clip.translation[one])
-        _, index, _ = rasterise(
-            posed[0].numpy(), triangles, camera.resized(matte.MASK_SIDE, matte.MASK_SIDE)
-        )
-        masks[row] = matte.eroded(index >= 0)
+
+    def draw(start: int, stop: int) -> None:
+        for row in range(start, stop):
+            camera = Camera(
+                clip.width, clip.height, clip.intrinsics[row], clip.camera_to_world[row]
+            )
+            one = slice(row, row + 1)
+            posed = head.pose(betas, clip.expression[one], clip.pose[one], clip.translation[one])
+            _, index, _ = rasterise(
+                posed[0].numpy(), triangles, camera.resized(matte.MASK_SIDE, matte.MASK_SIDE)
+            )
+            masks[row] = matte.eroded(index >= 0)
+
+    run_chunks(draw, len(clip), 4)
     return masks
