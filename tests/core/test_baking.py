@@ -62,7 +62,7 @@ def test_its_pictures_are_like_the_fields_and_not_like_anothers(toy_avatar, bake
     for a, b in zip(own, other, strict=True):
         assert a.head_psnr > b.head_psnr + 1
     middle = own[0].field[..., 3] > 0.5
-    assert (own[0].mesh[..., 3] > 0.5)[middle].mean() > 0.9
+    assert (own[0].mesh[..., 3] > 0.5)[middle].mean() > 0.85
 
 
 def test_the_file_holds_mesh_texture_and_no_light(baked, tmp_path):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -66,7 +66,9 @@ def _tracked(collection: Collection, clip: Clip) -> np.ndarray:
     if clip.vertices is not None:
         return np.asarray(collection.head.landmarks(clip.vertices))
     model = LandmarkModel(collection.head, len(collection.betas))
-    return model.pose(collection.betas, clip.expression, clip.pose, clip.translation).points
+    posed = model.pose(collection.betas, clip.expression, clip.pose, clip.translation)
+    from_camera = posed.points - clip.camera_to_world[:, None, :3, 3]
+    return posed.points + model.strayed(replace(posed, points=from_camera))
 
 
 def left_out(collection: Collection) -> list[tuple[str, str, str]]:

@@ -47,33 +47,42 @@ def _let_through(sigma, delta):
     return taken, fma(s, p, s)
 
 
+@njit(inline="always")
+def _passes(taken, through):
+    return np.float64(through) if taken > np.float32(0.5) else 1.0 - np.float64(taken)
+
+
 @njit(**OPTIONS)
 def _opacities(first, last, sigma, delta, taken, passed):
-    """1 - exp(-sigma delta) of samples first to last, and in passed, from 0 on, what it leaves."""
-    one = splat(delta[0])
+    """1 - exp(-sigma delta) of samples first to last, and in passed, float64 and from 0 on, what it
+    leaves: of thin samples 1 less what they take, since hundreds of them are multiplied, and each
+    rounded to float32 next to 1 is off the same way."""
+    one, through = splat(delta[0]), np.empty(LANES, np.float32)
     whole = first + (last - first) // LANES * LANES
     for i in range(first, whole, LANES):
         width = one if len(delta) == 1 else load(delta, i)
-        alpha, through = _let_through(load(sigma, i), width)
+        alpha, beyond = _let_through(load(sigma, i), width)
         store(taken, i, alpha)
-        store(passed, i - first, through)
+        store(through, 0, beyond)
+        for k in range(LANES):
+            passed[i - first + k] = _passes(taken[i + k], through[k])
     rest = np.zeros(3 * LANES, np.float32)
     for i in range(whole, last):
         rest[i - whole] = sigma[i]
         rest[LANES + i - whole] = delta[0 if len(delta) == 1 else i]
-    alpha, through = _let_through(load(rest, 0), load(rest, LANES))
+    alpha, beyond = _let_through(load(rest, 0), load(rest, LANES))
     store(rest, 2 * LANES, alpha)
-    store(rest, LANES, through)
+    store(rest, LANES, beyond)
     for i in range(whole, last):
         taken[i] = rest[2 * LANES + i - whole]
-        passed[i - first] = rest[LANES + i - whole]
+        passed[i - first] = _passes(taken[i], rest[LANES + i - whole])
 
 
 @njit(**OPTIONS)
 def _weigh(start, stop, offsets, sigma, delta, transmittance, weights):
     """Writes the weights of the rays' samples and lowers what the rays have left."""
     begin, end = offsets[start], offsets[stop]
-    passed = np.empty(end - begin, np.float32)
+    passed = np.empty(end - begin, np.float64)
     _opacities(begin, end, sigma, delta, weights, passed)
     for ray in range(start, stop):
         left = np.float64(transmittance[ray])
@@ -86,7 +95,7 @@ def _weigh(start, stop, offsets, sigma, delta, transmittance, weights):
 @njit(**OPTIONS)
 def _forward(start, stop, offsets, sigma, rgb, t, delta, colour, opacity, depth, weights):
     begin, end = offsets[start], offsets[stop]
-    passed = np.empty(end - begin, np.float32)
+    passed = np.empty(end - begin, np.float64)
     _opacities(begin, end, sigma, delta, weights, passed)
     for ray in range(start, stop):
         left = 1.0
@@ -129,7 +138,7 @@ def _backward(
     it is empty.
     """
     begin, end = offsets[start], offsets[stop]
-    passed = np.empty(end - begin, np.float32)
+    passed = np.empty(end - begin, np.float64)
     _opacities(begin, end, sigma, delta, grad_sigma, passed)
     one_delta = len(delta) == 1
     for ray in range(start, stop):
