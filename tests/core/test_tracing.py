@@ -201,6 +201,12 @@ def test_bricks_spare_searches_and_hide_next_to_nothing(toy_avatar, pose):
          flat(voxels.box_min), np.float32(voxels.scale)),
         marching.grid_of(space),
     )  # fmt: skip
+    # a place on the box's far corner, by rounding, is one of the last brick
+    side = len(voxels.bricks) / voxels.scale
+    corner = (voxels.box_min.numpy() + side * (1 + 1e-6))[None].astype(np.float32)
+    last = (np.array([-1], np.int32), 1, flat(voxels.maps), flat(voxels.box_min),
+            np.float32(1 / side))  # fmt: skip
+    assert filled_near(corner, last, marching.grid_of(space)).all()
     where = torch.from_numpy(points)
     triangle, barycentric, _ = ops.nearest.nearest(scene.mesh.search, where)
     canonical = ops.marching.canonicalise(where, triangle, barycentric, scene.mesh)

@@ -168,8 +168,11 @@ def _filled_near(x, y, z, voxels, grid):
     at a table, which spares most of the searches that would find nothing."""
     bricks, brick_count, maps, corner, scale = voxels
     cells, size, grid_corner, grid_scale = grid
-    u = np.int64((x - corner[0]) * scale) * brick_count + np.int64((y - corner[1]) * scale)
-    row = bricks[u * brick_count + np.int64((z - corner[2]) * scale)]
+    far = brick_count - 1  # by rounding, a place on the last brick's face may lie beyond it
+    u = min(np.int64((x - corner[0]) * scale), far)
+    v = min(np.int64((y - corner[1]) * scale), far)
+    w = min(np.int64((z - corner[2]) * scale), far)
+    row = bricks[(u * brick_count + v) * brick_count + w]
     if row < 0:
         return True
     at = row * _MAP
