@@ -188,42 +188,6 @@ def test_voxels_are_tight_and_say_which_cell_they_are():
     assert (near == 0).float().mean() > 0.4
 
 
-def test_brick_cells_as_the_reference():
-    generator = torch.Generator().manual_seed(3)
-    middles = torch.rand((200, 3), generator=generator) * 0.4 - 0.2  # some outside the box
-    maps = torch.eye(3) + 0.3 * torch.randn((200, 3, 3), generator=generator)
-    got, want = (k.brick_cells(middles, maps, ball(), 0.003) for k in (CPU, reference))
-    assert (got == want).float().mean() > 0.999
-    assert 0.05 < (want >= 0).float().mean() < 0.9
-
-
-def test_torn_bricks_as_the_reference_take_their_neighbours_cells():
-    """Two halves whose maps have nothing to do with one another: the seam belongs to both."""
-    generator = torch.Generator().manual_seed(4)
-    where = torch.cartesian_prod(*[torch.arange(8)] * 3).int() + 1
-    at = torch.full((10, 10, 10), -1, dtype=torch.int32)
-    at[where.long().unbind(1)] = torch.arange(512, dtype=torch.int32)
-    left = where[:, 0] <= 4
-    middles = where * 0.012 - 0.05
-    canonical = torch.where(left[:, None], middles, middles + torch.tensor([0.0, 0.09, 0.0]))
-    maps = torch.eye(3).repeat(512, 1, 1) + 0.01 * torch.randn((512, 3, 3), generator=generator)
-    filled, leaps = [], []
-    for kernels in (CPU, reference):
-        cells = kernels.brick_cells(canonical, maps, ball(), 0.003)
-        own = cells.clone()
-        leaps.append(kernels.add_torn(cells, at, where, canonical, maps, ball(), 0.003, 5))
-        changed = (cells != own).any(1)
-        assert (own[changed] < 0).any()
-        assert torch.equal(cells[own >= 0], own[own >= 0])  # what was known stays
-        assert set(where[changed][:, 0].tolist()) <= {4, 5}  # the seam alone
-        filled.append(cells)
-    assert (filled[0] == filled[1]).float().mean() > 0.999
-    torch.testing.assert_close(*leaps, rtol=0, atol=1e-6)
-    seam = (where[:, 0] == 4) | (where[:, 0] == 5)
-    assert leaps[0][seam].min() > 0.08
-    assert leaps[0][~seam].max() < 0.004
-
-
 def test_voxels_hide_little_where_a_turned_head_tears_space():
     """Something stands 4 to 10 cm off the neck, and the head turns: between skull and shoulders the
     nearest point leaps from one to the other."""

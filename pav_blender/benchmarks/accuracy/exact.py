@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from ...core import kernels
-from ...core.deformation.frames import vertex_maps
+from ...core.deformation import vertex_maps
 from ...core.deformation.rigid import stance
 from ...core.field.avatar import Avatar
 from ...core.field.field import Field, Samples, Worn, condition

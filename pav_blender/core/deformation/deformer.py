@@ -8,7 +8,6 @@ import torch
 from ..errors import InputError
 from ..kernels import select
 from ..kernels.structures import MODES, PosedMesh
-from .frames import triangle_maps, vertex_maps
 
 
 class Deformer:
@@ -65,9 +64,11 @@ class Deformer:
             )
         search = self.kernels.nearest.refit(self.topology, posed)
         if self.mode == "smooth":
-            maps = vertex_maps(self.canonical_vertices, posed, self.triangles)
+            maps = self.kernels.frames.vertex_maps(self.canonical_vertices, posed, self.triangles)
             return PosedMesh(self.mode, search, self.triangles, posed, vertex_maps=maps)
-        maps = triangle_maps(self.canonical_vertices, posed, self.triangles, self.mode)
+        maps = self.kernels.frames.triangle_maps(
+            self.canonical_vertices, posed, self.triangles, self.mode
+        )
         return PosedMesh(self.mode, search, self.triangles, posed, triangle_maps=maps)
 
     def nearest(

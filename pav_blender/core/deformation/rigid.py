@@ -17,11 +17,10 @@ def head_rotation(canonical: np.ndarray, posed: np.ndarray, weights: np.ndarray)
     Weighted least squares (Kabsch 1976), so it follows any deformer, not only an armature.
     weights [V] say which vertices move rigidly with the skull.
     """
-    total = max(float(weights.sum()), 1e-12)
-    w = (weights / total).astype(np.float64)[:, None]
-    a = canonical - (w * canonical).sum(0)
-    b = posed - (w * posed).sum(0)
-    u, _, vt = np.linalg.svd((w * b).T @ a)
+    w = weights.astype(np.float64) / max(float(weights.sum()), 1e-12)
+    a, b = (np.ascontiguousarray(mesh.T, np.float64) for mesh in (canonical, posed))
+    a, b = a - (a @ w)[:, None], b - (b @ w)[:, None]
+    u, _, vt = np.linalg.svd((w * b) @ a.T)
     flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt)) or 1.0])
     return (u @ flip @ vt).astype(np.float32)
 

@@ -7,18 +7,19 @@ whose middle is too far from any occupied cell are left out.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 
 from .. import kernels
-from ..kernels.reference.picking import BRICK, TORN, cells_from_occupied
+from ..kernels.reference.bricks import BRICK, SLACK, TORN, Found
 from ..kernels.structures import Clearance, PosedMesh, Voxels
 from .occupancy import clearance
 
 _VOXEL = 0.003  # metres
 _STRETCH = 1.4  # of the map from posed to canonical space that is allowed for
+_CORNER = 0.87  # of a side, from the middle of a cube to its corners
 _BESIDE = 2.0  # times the margin of a cube: what is beside it may be torn from it
 _SLACK = 3e-4  # metres that a brick's map is trusted to, beside what its neighbours' differ by
 _SIDES = (16, 8, 4)  # in voxels, of the cubes that are looked at one after the other
@@ -33,15 +34,13 @@ def voxels(mesh: PosedMesh, space: Clearance, reach: float) -> Voxels:
     extent = float((mesh.vertices.amax(0) + reach - low).max())
     count = -(-int(np.ceil(extent / _VOXEL)) // _SIDES[0])
     places = torch.cartesian_prod(*[torch.arange(count, dtype=torch.int32)] * 3)
-    children = torch.cartesian_prod(*[torch.arange(2, dtype=torch.int32)] * 3)
-    for size in _SIDES:  # block by block: neighbours share a search
-        if size < _SIDES[0]:
-            places = (2 * places[:, None] + children).view(-1, 3)
-        middles = low + (places + 0.5) * (size * _VOXEL)
-        kept, found = _near_filled(mesh, space, reach, middles, size * _VOXEL)
-        places = places[kept]
-    cells, maps = _brick_cells(mesh, space, places, found, middles[kept])
-    held = (cells >= 0).any(1)
+    far = torch.full((len(places), 3), torch.inf)
+    near = _near(mesh, space, reach, low, places, far, _SIDES[0])
+    for size in _SIDES[1:]:
+        near = _near(mesh, space, reach, low, *_parts(mesh, space, near, size), size)
+    places = near.places
+    cells, maps = _brick_cells(mesh, space, near)
+    held = (cells.amax(1) >= 0).nonzero()[:, 0]
     places, cells, maps = places[held], cells[held], maps[held]
     corner = places.amin(0) if len(places) else torch.zeros(3, dtype=torch.int32)
     count = int((places - corner).max()) + 1 if len(places) else 1
@@ -55,65 +54,83 @@ def voxels(mesh: PosedMesh, space: Clearance, reach: float) -> Voxels:
     return Voxels(bricks, cells.view(shape), low + corner * side, 1 / side, maps)
 
 
-class _Found(NamedTuple):
-    """Where posed points lie on the mesh and in canonical space, and how many cells off the nearest
-    occupied one is."""
-
-    triangle: torch.Tensor
-    barycentric: torch.Tensor
-    canonical: torch.Tensor
-    clear: torch.Tensor
+def _cells(margin: float, space: Clearance) -> int:
+    """How many cells from an occupied one something may lie that is `margin` metres off in posed
+    space."""
+    return int(np.ceil(margin * _STRETCH / space.cell))
 
 
-def _near_filled(
-    mesh: PosedMesh, space: Clearance, reach: float, middles: torch.Tensor, side: float
-) -> tuple[torch.Tensor, _Found]:
-    """Which cubes [N], by their middles [N, 3] and side, may hold something or are beside such, and
-    where the middles of those lie."""
-    ops = kernels.select("cpu")
-    triangle, barycentric, distance = ops.nearest.nearest(mesh.search, middles)
-    canonical = ops.marching.canonicalise(middles, triangle, barycentric, mesh)
-    half = 0.87 * side
-    clear = cells_from_occupied(canonical, space)
-    kept = (distance <= reach + half) & (clear <= np.ceil(_BESIDE * half * _STRETCH / space.cell))
-    return kept, _Found(triangle[kept], barycentric[kept], canonical[kept], clear[kept])
+@dataclass(frozen=True, eq=False)
+class _Cubes:
+    """Cubes at places [N, 3], counted in their own side, with their middles [N, 3] in metres and
+    what was found of these."""
+
+    places: torch.Tensor
+    middles: torch.Tensor
+    found: Found
+
+
+def _near(
+    mesh: PosedMesh,
+    space: Clearance,
+    reach: float,
+    low: torch.Tensor,
+    places: torch.Tensor,
+    feet: torch.Tensor,
+    size: int,
+) -> _Cubes:
+    """Those of the cubes at places [N, 3], of `size` voxels, that may hold something or are beside
+    such; feet [N, 3]: a point of the mesh near each, or infinite."""
+    middles = low + (places + 0.5) * (size * _VOXEL)
+    half = _CORNER * size * _VOXEL
+    ops = kernels.select("cpu").bricks
+    found = ops.look(mesh, space, middles, reach + half, _cells(_BESIDE * half, space), feet)
+    kept = found.kept.nonzero()[:, 0]
+    return _Cubes(places[kept], middles[kept], found.pick(kept))
+
+
+def _parts(
+    mesh: PosedMesh, space: Clearance, cubes: _Cubes, size: int
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Places [M, 3] of the parts, of `size` voxels, half the cubes' own, that may hold something,
+    block by block, and each one's point on the mesh. Most are told by the cube's map, without a
+    search."""
+    ops, places = kernels.select("cpu").bricks, cubes.places
+    side = 2 * size * _VOXEL
+    maps = ops.brick_maps(mesh, cubes.found, cubes.middles)
+    leaps = torch.zeros(len(maps))
+    if len(places):
+        leaps = ops.leaps(*_grid_of(places), cubes.found.canonical, maps, side)
+    margin = _cells(_CORNER * size * _VOXEL, space)
+    likely = ops.likely(cubes.found.canonical, maps, leaps, space, side, margin)
+    whole, part = likely.nonzero().unbind(1)
+    within = torch.cartesian_prod(*[torch.arange(2, dtype=torch.int32)] * 3)
+    return 2 * places[whole] + within[part], cubes.found.foot[whole]
 
 
 def _brick_cells(
-    mesh: PosedMesh,
-    space: Clearance,
-    places: torch.Tensor,
-    found: _Found,
-    middles: torch.Tensor,
+    mesh: PosedMesh, space: Clearance, bricks: _Cubes
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Canonical cells [N, 64] of bricks at places [N, 3], and their maps [N, 16] (`Voxels`). Within
-    a brick the map is as good as affine, but for bricks in which the nearest point leaps from one
-    part of the mesh to another: their voxels may lie where a neighbour's map takes them as well."""
-    ops = kernels.select("cpu").picking
-    maps = _linear(mesh, found.triangle, found.barycentric)
-    margin = int(np.ceil(0.87 * BRICK * _VOXEL * _STRETCH / space.cell))
-    cells = torch.full((len(places), BRICK**3), -1, dtype=torch.int32)
-    own = (found.clear <= margin).nonzero()[:, 0]
-    cells[own] = ops.brick_cells(found.canonical[own], maps[own], space, _VOXEL)
-    leaps = torch.zeros(len(cells))
-    if len(places):
-        corner = places.amin(0) - 1
-        at = torch.full(tuple((places.amax(0) - corner + 2).tolist()), -1, dtype=torch.int32)
-        where = places - corner
-        at[where.long().unbind(1)] = torch.arange(len(places), dtype=torch.int32)
-        leaps = ops.add_torn(cells, at, where, found.canonical, maps, space, _VOXEL, margin)
-    moved = found.canonical[..., None] - maps @ middles[..., None]
-    slack = torch.where(leaps > TORN, torch.inf, leaps + _SLACK)
-    unused = torch.zeros(len(cells), 3)
-    rows = torch.cat([torch.cat([maps, moved], 2).view(-1, 12), slack[:, None], unused], 1)
-    return cells, rows
+    """Canonical cells [N, 64] of bricks, and their maps [N, 16] (`Voxels`). Within a brick the map
+    is as good as affine, but for bricks in which the nearest point leaps from one part of the mesh
+    to another: their voxels may lie where a neighbour's map takes them as well."""
+    ops, found = kernels.select("cpu").bricks, bricks.found
+    margin = _cells(_CORNER * BRICK * _VOXEL, space)
+    maps = ops.brick_maps(mesh, found, bricks.middles)
+    cells = ops.brick_cells(found, maps, space, _VOXEL, margin)
+    if len(cells):
+        cubes = *_grid_of(bricks.places), found.canonical, maps
+        ops.add_torn(cells, *cubes, space, _VOXEL, margin)
+        leaps = ops.leaps(*cubes, BRICK * _VOXEL)
+        maps[:, SLACK] = torch.where(leaps > TORN, torch.inf, leaps + _SLACK)
+    return cells, maps
 
 
-def _linear(mesh: PosedMesh, triangle: torch.Tensor, barycentric: torch.Tensor) -> torch.Tensor:
-    """The linear part [N, 3, 3] of the maps to canonical space at points of the mesh."""
-    index = triangle.long().clamp(min=0)
-    if mesh.triangle_maps is not None:
-        return mesh.triangle_maps[index, :, :3]
-    assert mesh.vertex_maps is not None
-    corners = mesh.triangles.long()[index]
-    return (mesh.vertex_maps[corners, :, :3] * barycentric[..., None, None]).sum(1)
+def _grid_of(places: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Rows of cubes in a grid with a free border, -1 where there is none, and places [N, 3] in
+    it."""
+    corner = places.amin(0) - 1
+    at = torch.full(tuple((places.amax(0) - corner + 2).tolist()), -1, dtype=torch.int32)
+    where = places - corner
+    at[where.long().unbind(1)] = torch.arange(len(places), dtype=torch.int32)
+    return at, where

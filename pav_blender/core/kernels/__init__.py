@@ -1,8 +1,7 @@
 """Two implementations of one interface: `reference` (plain torch, any device) and `cpu` (numba).
 
-Both folders hold the same file names (nearest, encoding, mlp, marching, picking, optimiser,
-solids, sparing) with the same functions. Code that computes asks for one of them and never names
-it:
+Both folders hold the same file names (`MODULES`) with the same functions. Code that computes asks
+for one of them and never names it:
 
 >>> from pav_blender.core.kernels import select
 >>> kernels = select("cpu")
@@ -20,7 +19,8 @@ from typing import Any
 _plain = False
 
 MODULES = (
-    *("nearest", "encoding", "mlp", "marching", "picking", "optimiser", "solids", "sparing"),
+    *("frames", "nearest", "encoding", "mlp", "marching", "bricks", "picking", "optimiser"),
+    *("solids", "sparing"),
 )
 
 

@@ -274,6 +274,17 @@ def grid_of(clearance: Clearance | None) -> tuple[np.ndarray, int, np.ndarray, n
     return grid, size, flat(clearance.box_min), np.float32(clearance.box_scale * size)
 
 
+def surface_of(mesh: PosedMesh) -> tuple[Any, ...]:
+    """What compiled functions are told of a mesh: its search tree, maps, vertices, corners."""
+    return (
+        mesh.search.arrays,
+        _maps(mesh.triangle_maps),
+        _maps(mesh.vertex_maps),
+        flat(mesh.vertices),
+        mesh.search.topology.corners.reshape(-1),
+    )
+
+
 def walk(
     mesh: PosedMesh,
     origins: torch.Tensor,
@@ -287,11 +298,7 @@ def walk(
 ) -> tuple[Any, ...]:
     """What compiled functions are told of a mesh, rays and the clearance; as `march`."""
     return (
-        mesh.search.arrays,
-        _maps(mesh.triangle_maps),
-        _maps(mesh.vertex_maps),
-        flat(mesh.vertices),
-        mesh.search.topology.corners.reshape(-1),
+        *surface_of(mesh),
         rows_of(origins, np.float32),
         rows_of(directions, np.float32),
         rows_of(first, np.int32),

@@ -10,10 +10,11 @@ import numpy as np
 import torch
 from numba import njit
 
-from ..reference.picking import BRICK, FALL, GOLDEN, LEAST, RISE, TORN
+from ..reference.bricks import BRICK
+from ..reference.picking import FALL, GOLDEN, LEAST, RISE
 from ..structures import Clearance, Picks, PosedMesh, Thrift, Voxels
 from .lanes import LANES, load, splat_int
-from .marching import clear_cells, flat, grid_of, locate, rows_of, walk
+from .marching import clear_cells, flat, locate, rows_of, walk
 from .search import LEAN, OPTIONS, STACK
 from .threads import run_chunks
 
@@ -228,112 +229,6 @@ def _pick(start, stop, arrays, triangle_maps, vertex_maps, vertices, corners,
                 kept[i] = to + 1
         for i in range(rays):
             out_count[base + i] = kept[i]
-
-
-def brick_cells(
-    canonical: torch.Tensor, maps: torch.Tensor, space: Clearance, voxel: float
-) -> torch.Tensor:
-    """As the reference, up to the rounding of the places."""
-    cells = torch.empty((len(canonical), BRICK**3), dtype=torch.int32)
-    middles, linear = rows_of(canonical, np.float32), rows_of(maps, np.float32)
-    grid = grid_of(space)
-    run_chunks(
-        _brick_cells, len(cells), 512, middles, linear, *grid, np.float32(voxel), cells.numpy()
-    )
-    return cells
-
-
-@njit(**LEAN)
-def _cell_near(grid, size, corner, scale, x, y, z):
-    """The cell of canonical (x, y, z), or the nearest, and how many cells off a filled one is."""
-    flat, far = 0, 0
-    for axis in range(3):
-        place = ((x, y, z)[axis] - corner[axis]) * scale
-        cell = int(np.floor(min(max(place, np.float32(-3.0)), np.float32(size + 3))))
-        inside = min(max(cell, 0), size - 1)
-        far = max(far, abs(cell - inside))
-        flat = flat * size + inside
-    return flat, max(far, int(grid[flat]))
-
-
-@njit(**LEAN)
-def _fill(out, x, y, z, linear, grid, size, corner, scale, voxel):
-    """Cells of a brick's voxels that have none yet, its middle lying at canonical (x, y, z)."""
-    for i in range(BRICK**3):
-        if out[i] >= 0:
-            continue
-        u = (np.float32(i // BRICK**2) + np.float32(0.5 - BRICK / 2)) * voxel
-        v = (np.float32(i // BRICK % BRICK) + np.float32(0.5 - BRICK / 2)) * voxel
-        w = (np.float32(i % BRICK) + np.float32(0.5 - BRICK / 2)) * voxel
-        flat, far = _cell_near(
-            grid, size, corner, scale,
-            x + linear[0, 0] * u + linear[0, 1] * v + linear[0, 2] * w,
-            y + linear[1, 0] * u + linear[1, 1] * v + linear[1, 2] * w,
-            z + linear[2, 0] * u + linear[2, 1] * v + linear[2, 2] * w)  # fmt: skip
-        if far <= 1:
-            out[i] = flat
-
-
-@njit(**OPTIONS)
-def _brick_cells(start, stop, canonical, maps, grid, size, corner, scale, voxel, out):
-    for brick in range(start, stop):
-        out[brick] = -1
-        x, y, z = canonical[brick, 0], canonical[brick, 1], canonical[brick, 2]
-        _fill(out[brick], x, y, z, maps[brick], grid, size, corner, scale, voxel)
-
-
-def add_torn(
-    cells: torch.Tensor,
-    at: torch.Tensor,
-    places: torch.Tensor,
-    canonical: torch.Tensor,
-    maps: torch.Tensor,
-    space: Clearance,
-    voxel: float,
-    margin: int,
-) -> torch.Tensor:
-    """As the reference, up to the rounding of the places."""
-    leaps = torch.zeros(len(cells))
-    run_chunks(
-        _add_torn,
-        len(cells),
-        2048,
-        rows_of(at, np.int32),
-        rows_of(places, np.int32),
-        rows_of(canonical, np.float32),
-        rows_of(maps, np.float32),
-        *grid_of(space),
-        np.float32(voxel),
-        margin,
-        cells.numpy(),
-        leaps.numpy(),
-    )
-    return leaps
-
-
-@njit(**OPTIONS)
-def _add_torn(start, stop, at, places, canonical, maps, grid, size, corner, scale, voxel, margin,
-              out, leaps):  # fmt: skip
-    side = np.float32(BRICK) * voxel
-    for brick in range(start, stop):
-        for axis in range(3):
-            for sign in (1, -1):
-                u, v, w = places[brick, 0], places[brick, 1], places[brick, 2]
-                beside = at[u + (sign if axis == 0 else 0), v + (sign if axis == 1 else 0),
-                            w + (sign if axis == 2 else 0)]  # fmt: skip
-                if beside < 0:
-                    continue
-                back = np.float32(sign) * side
-                x = canonical[beside, 0] - back * maps[beside, 0, axis]
-                y = canonical[beside, 1] - back * maps[beside, 1, axis]
-                z = canonical[beside, 2] - back * maps[beside, 2, axis]
-                leap = max(abs(x - canonical[brick, 0]), abs(y - canonical[brick, 1]),
-                           abs(z - canonical[brick, 2]))  # fmt: skip
-                leaps[brick] = max(leaps[brick], leap)
-                if leap > np.float32(TORN) and (
-                    _cell_near(grid, size, corner, scale, x, y, z)[1] <= margin
-                ):
-                    _fill(out[brick], x, y, z, maps[beside], grid, size, corner, scale, voxel)
 
 
 def follow(guide: torch.Tensor, cells: torch.Tensor, density: torch.Tensor) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from numba import njit
 
+from ..reference.bricks import MAP, SLACK
 from ..structures import Clearance, PosedMesh, Probing, Traced, Voxels
 from .fields import (
     arrays_of,
@@ -34,7 +35,6 @@ from .threads import run_chunks
 __all__ = ["arrays_of", "known_density", "short_tables", "trace"]
 
 GROUP = 256  # rays that advance together
-_MAP = 16  # numbers of a brick's map
 _NONE, _WANTED = -1, -2
 
 
@@ -175,8 +175,8 @@ def _filled_near(x, y, z, voxels, grid):
     row = bricks[(u * brick_count + v) * brick_count + w]
     if row < 0:
         return True
-    at = row * _MAP
-    slack = maps[at + 12] * grid_scale  # in cells
+    at = row * MAP
+    slack = maps[at + SLACK] * grid_scale  # in cells
     if not slack < 1:
         return True
     cx = maps[at] * x + maps[at + 1] * y + maps[at + 2] * z + maps[at + 3]

@@ -13,11 +13,10 @@ import math
 import torch
 
 from ..structures import Clearance, Picks, PosedMesh, Thrift, Voxels
+from .bricks import BRICK
 from .marching import canonicalise, occupied
 from .nearest import nearest
 
-BRICK = 4  # voxels a side
-TORN = 0.004  # metres between where two bricks' maps take a place, from which they are torn
 LEAST = 1e-4  # density (1/m) that the guide calls empty
 RISE, FALL = 0.15, 0.5  # parts of the way that one sample moves the guide
 GOLDEN = 0.6180339887
@@ -154,76 +153,6 @@ def _located(
         spread(canonical[keep], real),
         spread(distance[keep], real),
     )
-
-
-def cells_from_occupied(canonical: torch.Tensor, space: Clearance) -> torch.Tensor:
-    """How many cells canonical points [N, 3] are from an occupied one, chessboard distance [N]."""
-    return _in_grid(canonical, space)[1]
-
-
-def _in_grid(canonical: torch.Tensor, space: Clearance) -> tuple[torch.Tensor, torch.Tensor]:
-    """Flat cell of canonical points [N, 3], and how many cells the nearest occupied one is off."""
-    size = space.grid.shape[0]
-    place = ((canonical - space.box_min) * (space.box_scale * size)).floor()
-    cell = place.clamp(0, size - 1)
-    outside = (cell - place).abs().amax(1)
-    x, y, z = cell.long().unbind(1)
-    flat = (x * size + y) * size + z
-    return flat, space.grid.view(-1)[flat].float().maximum(outside)
-
-
-def brick_cells(
-    canonical: torch.Tensor, maps: torch.Tensor, space: Clearance, voxel: float
-) -> torch.Tensor:
-    """Canonical cells [N, 64] int32 of the voxels of bricks, -1 where no occupied cell is beside.
-
-    canonical [N, 3]: where the bricks' middles lie; maps [N, 3, 3]: the linear part of the map
-    there, which is taken to hold over the brick; voxel: side in metres.
-    """
-    within = torch.cartesian_prod(*[torch.arange(BRICK, device=canonical.device)] * 3)
-    offsets = (within + 0.5 - BRICK / 2) * voxel
-    around = canonical[:, None] + offsets @ maps.mT
-    cells, clear = _in_grid(around.view(-1, 3), space)
-    return torch.where(clear <= 1, cells, -1).int().view(-1, BRICK**3)
-
-
-def add_torn(
-    cells: torch.Tensor,
-    at: torch.Tensor,
-    places: torch.Tensor,
-    canonical: torch.Tensor,
-    maps: torch.Tensor,
-    space: Clearance,
-    voxel: float,
-    margin: int,
-) -> torch.Tensor:
-    """Where the nearest point leaps from one part of a mesh to another between two bricks, the
-    map of each may hold in part of the other: cells [N, 64] are set, in place, where they have
-    none, to what the maps of torn neighbours say.
-
-    at: rows of bricks in a grid with a free border, -1 where there is none; places [N, 3]: where
-    each is in it; canonical, maps, voxel as in `brick_cells`; margin: cells from an occupied one
-    beyond which nothing in a brick can be. Returns how far [N], in metres, a brick's middle is at
-    most from where the maps beside it take it.
-    """
-    side = BRICK * voxel
-    leaps = canonical.new_zeros(len(cells))
-    for axis in range(3):
-        for sign in (1, -1):
-            step = torch.zeros(3, dtype=places.dtype, device=places.device)
-            step[axis] = sign
-            beside = at[(places + step).long().unbind(1)].long()
-            bricks = (beside >= 0).nonzero()[:, 0]
-            beside = beside[bricks]
-            there = canonical[beside] - sign * side * maps[beside, :, axis]
-            leap = (there - canonical[bricks]).abs().amax(1)
-            leaps[bricks] = torch.maximum(leaps[bricks], leap)
-            torn = leap > TORN
-            torn &= cells_from_occupied(there, space) <= margin
-            bricks, beside, there = bricks[torn], beside[torn], there[torn]
-            found = brick_cells(there, maps[beside], space, voxel)
-            cells[bricks] = torch.where(cells[bricks] < 0, found, cells[bricks])
-    return leaps
 
 
 def follow(guide: torch.Tensor, cells: torch.Tensor, density: torch.Tensor) -> None:

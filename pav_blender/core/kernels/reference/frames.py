@@ -12,7 +12,7 @@ from __future__ import annotations
 import torch
 
 # A triangle lower than this fraction of its longest edge counts as degenerate.
-_FLATNESS = 1e-5
+FLATNESS = 1e-5
 
 
 def _corners(vertices: torch.Tensor, triangles: torch.Tensor) -> torch.Tensor:
@@ -25,7 +25,7 @@ def _normals(corners: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.T
     cross = torch.linalg.cross(b - a, c - a)
     area = cross.norm(dim=-1)
     longest = torch.stack([b - a, c - b, a - c], -1).square().sum(-2).amax(-1)
-    usable = area > _FLATNESS * longest
+    usable = area > FLATNESS * longest
     safe = torch.where(usable, area, 1.0)
     return torch.where(usable[..., None], cross / safe[..., None], 0.0), area, usable
 
