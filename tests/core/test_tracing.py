@@ -183,7 +183,9 @@ def test_numbers_beyond_bfloat16_stay_in_float32(toy, frames, pose):
 def filled_near(points, voxels, grid):
     found = np.zeros(len(points), np.bool_)
     for i in range(len(points)):
-        found[i] = tracing._filled_near(points[i, 0], points[i, 1], points[i, 2], voxels, grid)
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        brick = tracing._brick_at(x, y, z, voxels)
+        found[i] = tracing._filled_near(x, y, z, brick, voxels[2], grid)
     return found
 
 

@@ -58,7 +58,7 @@ class Voxels:
     the grid of a `Clearance`, or -1. A posed point x lies in brick `floor((x - box_min) * scale)`;
     outside the box there is nothing. `maps` holds for each brick an affine map [3, 4] from posed to
     canonical space, how far its answer may be off (metres, infinite where the mesh is torn), and
-    three numbers that make a row of sixteen.
+    the mesh's nearest point to the brick's middle.
     """
 
     bricks: torch.Tensor  # [N,N,N] int32

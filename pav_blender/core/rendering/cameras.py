@@ -70,22 +70,18 @@ class Camera:
         (fx, skew, cx), (_, fy, cy), _ = self.intrinsics
         v = (np.asarray(y, np.float64) + 0.5 - cy) / fy
         u = (np.asarray(x, np.float64) + 0.5 - cx - skew * v) / fx
-        turn = self.camera_to_world[:3, :3].T
+        turn, ones = self.camera_to_world[:3, :3], np.ones_like(u)
         if self.parallel:
-            origins = self.origin + np.stack([u, v, np.zeros_like(u)], axis=1) @ turn
-            local, length = np.tile([0.0, 0.0, 1.0], (len(u), 1)), np.ones_like(u)
+            length, world = ones, np.tile(turn[:, 2:], len(u))
+            origins = self.origin[:, None] + turn[:, :2] @ np.stack([u, v])
         else:
-            origins = np.tile(self.origin, (len(u), 1))
-            local = np.stack([u, v, np.ones_like(u)], axis=1)
-            length = np.linalg.norm(local, axis=1)
-        world = (local / length[:, None]) @ turn
+            length = np.sqrt(u * u + v * v + 1)
+            world = turn @ np.stack([u, v, ones]) / length
+            origins = np.tile(self.origin[:, None], len(u))
         if start:
             origins = origins + start * world
-        return (
-            origins.astype(np.float32),
-            world.astype(np.float32),
-            (1 / length).astype(np.float32),
-        )
+        found = (np.ascontiguousarray(values.T, np.float32) for values in (origins, world))
+        return *found, (1 / length).astype(np.float32)
 
     def resized(self, width: int, height: int) -> Camera:
         """The same view with another number of pixels."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -23,13 +23,15 @@ TILE = 4  # rays go together in squares of pixels: neighbours share triangles an
 class RayBatch:
     """R rays: origins, directions [R, 3] (unit), cosine [R] (camera depth = t * cosine), end [R]:
     metres along each after which nothing is seen, None for no end; start: metres from the camera to
-    the origins, that a depth begins with."""
+    the origins, that a depth begins with; begin [R]: metres along each before which nothing is, as
+    far as known."""
 
     origins: torch.Tensor
     directions: torch.Tensor
     cosine: torch.Tensor
     end: torch.Tensor | None = None
     start: float = 0.0
+    begin: torch.Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.cosine)
@@ -41,9 +43,15 @@ class RayBatch:
         return self._each(lambda values: values[rows])
 
     def _each(self, change: Callable[[torch.Tensor], torch.Tensor]) -> RayBatch:
-        end = None if self.end is None else change(self.end)
+        begin, end = (None if t is None else change(t) for t in (self.begin, self.end))
         changed = change(self.origins), change(self.directions), change(self.cosine)
-        return RayBatch(*changed, end, self.start)
+        return RayBatch(*changed, end, self.start, begin)
+
+    def within(self, begin: np.ndarray, end: np.ndarray) -> RayBatch:
+        """The same rays where anything is only between these metres [R] along each."""
+        last = torch.from_numpy(end)
+        last = last if self.end is None else torch.minimum(self.end, last)
+        return replace(self, begin=torch.from_numpy(begin), end=last)
 
 
 def camera_rays(

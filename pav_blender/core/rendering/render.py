@@ -17,18 +17,18 @@ from ..deformation import Clearance, PosedMesh, Thrift, Voxels, voxels
 from ..deformation.rigid import Stance, stance
 from ..errors import Cancelled, InputError
 from ..field.avatar import Avatar
-from ..field.directions import spherical_harmonics
 from ..field.field import Samples, condition
 from ..field.frozen import freeze
 from ..field.mixture import geometry
 from ..kernels.cpu.threads import run_chunks, torch_alone
 from ..kernels.structures import Frozen, Picks, Probing, Traced, Wave
 from .cameras import Camera
+from .footprint import footprint
 from .rays import RayBatch, camera_rays, pack, samples_of, tiled
 from .sparing import passes
 from .wearing import Appearance, Wearing, deformer_of, short_tables_of, wearing_of
 
-_LEAST_CHUNK, _SHARES = 1 << 10, 4  # rays a thread takes at a time; times it should
+_LEAST_CHUNK, _SHARES = 1 << 10, 8  # rays a thread takes at a time; times it should
 _FAR_WAVE = 24  # samples a ray between two looks, where every look waits for a device
 _FINEST, _COARSEST = 1e-5, 0.1  # metres between places
 # float32 counts micrometres up to some metres: what is far off is brought near, by whole strides so
@@ -282,16 +282,22 @@ def render_scene(
             far = None if limits is None else limits[pixels]
             rows, columns = np.divmod(pixels, camera.width)
             rays = camera_rays(camera, columns, rows, far, before)
+            if where is not None:
+                rays = rays.within(*where.between(rows, columns))
             with torch.inference_mode():
                 rgba[pixels], depth[pixels], evaluated = _trace(scene, rays, settings)
             with counting:
                 done, evaluations = done + stop - start, evaluations + evaluated
             if ours and progress is not None:
-                progress(min(1.0, done / count))
+                progress(min(1.0, done / expected))
 
         shape = (camera.height, camera.width)
         picture = Picture(rgba.reshape(*shape, 4), depth.reshape(shape), 0)
+        where = footprint(scene.voxels, camera, before) if settings.skip else None
+        shown = np.ones(shape, bool) if where is None else where.covered(*shape)
+        expected = max(int(shown.sum()), 1)
         for wanted in passes(picture.rgba, picture.depth, limit, settings.agreement):
+            wanted &= shown
             pixels = order[wanted.reshape(-1)[order]]
             run_chunks(trace, len(pixels), _chunk(len(pixels), settings.chunk), pixels)
         if progress is not None:
@@ -364,27 +370,30 @@ def _field(scene: Scene, settings: RenderSettings) -> tuple[Any, ...]:
 
 def _whole(scene: Scene, rays: RayBatch, settings: RenderSettings) -> Traced:
     """The rays in one compiled pass."""
-    ops, stance = kernels.select("cpu"), scene.stance
-    near, far = ops.marching.bounds(scene.voxels.box, 0.0, rays.origins, rays.directions)
-    far = _ended(far, rays)
-    half = torch.full((len(rays),), 0.5)
-    first, last = ops.marching.lattice(near, far, half, settings.step)
-    turned = rays.directions @ torch.from_numpy(stance.rotation)
+    ops, stance, count = kernels.select("cpu").tracing, scene.stance, len(rays)
+    begin = torch.zeros(count) if rays.begin is None else rays.begin
+    end = torch.full((count,), torch.inf) if rays.end is None else rays.end
+    first, last = ops.enter(
+        scene.voxels, scene.known, rays.origins, rays.directions, begin, end, settings.step
+    )
+    seen = (first <= last).nonzero()[:, 0]  # most of a picture is empty
+    origins, directions = rays.origins[seen], rays.directions[seen]
     still = np.concatenate([stance.shoulders.T, stance.offset[:, None]], 1)
-    return ops.tracing.trace(
+    traced = ops.trace(
         scene.mesh,
         scene.voxels,
         scene.known,
         _field(scene, settings),
-        rays.origins,
-        rays.directions,
-        first,
-        last,
+        origins,
+        directions,
+        first[seen],
+        last[seen],
         settings.step,
         clearance=scene.clearance,
         band=scene.avatar.config.reach,
         still=torch.from_numpy(still),
-        views=spherical_harmonics(turned) @ scene.frozen.view,
+        rotation=torch.from_numpy(stance.rotation),
+        view=scene.frozen.view,
         probing=Probing(
             settings.wave,
             settings.share,
@@ -395,6 +404,10 @@ def _whole(scene: Scene, rays: RayBatch, settings: RenderSettings) -> Traced:
             settings.negligible,
         ),
     )
+    whole = Traced(torch.zeros(count, 4), torch.zeros(count), torch.ones(count), traced.evaluations)
+    for values, found in zip(whole[:3], traced[:3], strict=True):
+        values[seen] = found
+    return whole
 
 
 def _by_waves(scene: Scene, rays: RayBatch, settings: RenderSettings) -> Traced:

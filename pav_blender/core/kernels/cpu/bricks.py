@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from numba import njit
 
-from ..reference.bricks import BRICK, FAR, MAP, TORN, Found
+from ..reference.bricks import BRICK, FAR, FOOT, MAP, TORN, Found
 from ..structures import Clearance, PosedMesh
 from .lanes import (
     LANES,
@@ -136,6 +136,7 @@ def brick_maps(mesh: PosedMesh, found: Found, middles: torch.Tensor) -> torch.Te
         rows_of(found.triangle, np.int32),
         rows_of(found.barycentric, np.float32),
         rows_of(found.canonical, np.float32),
+        rows_of(found.foot, np.float32),
         rows_of(middles, np.float32),
         maps.view(-1).numpy(),
     )
@@ -143,7 +144,7 @@ def brick_maps(mesh: PosedMesh, found: Found, middles: torch.Tensor) -> torch.Te
 
 
 @njit(**OPTIONS)
-def _brick_maps(start, stop, surface, triangle, barycentric, canonical, middles, out):
+def _brick_maps(start, stop, surface, triangle, barycentric, canonical, foot, middles, out):
     _, triangle_maps, vertex_maps, _, corners = surface
     row = np.empty(LANES, np.float32)
     for brick in range(start, stop):
@@ -163,6 +164,7 @@ def _brick_maps(start, stop, surface, triangle, barycentric, canonical, middles,
                 out[brick * MAP + 4 * axis + j] = value
                 moved -= value * middles[brick, j]
             out[brick * MAP + 4 * axis + 3] = moved
+            out[brick * MAP + FOOT + axis] = foot[brick, axis]
 
 
 def brick_cells(

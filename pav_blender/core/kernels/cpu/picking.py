@@ -108,6 +108,16 @@ def visit(x, y, z, dx, dy, dz, bricks, brick_count):
 
 
 @njit(**LEAN)
+def beyond(x, y, z, dx, dy, dz):
+    """How far along a direction, one over which is (dx, dy, dz), the voxel of a place in bricks
+    ends."""
+    fine, one = np.float32(BRICK), np.int64(1)
+    u, v, w = x * fine, y * fine, z * fine
+    leave = min(_until(u, dx, int(u), one), _until(v, dy, int(v), one), _until(w, dz, int(w), one))
+    return leave / fine
+
+
+@njit(**LEAN)
 def _choose(ray, first, last, origins, directions, jitter, step, bricks, brick_count, cells, corner,
             scale, guide, chance, left, share, longest, opaque, width, k_out,
             steps_out):  # fmt: skip

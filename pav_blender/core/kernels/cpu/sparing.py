@@ -1,4 +1,4 @@
-"""Pixels that are the mean of their neighbours, compiled; see `reference/sparing.py`."""
+"""Pixels that need not be traced, compiled; see `reference/sparing.py`."""
 
 from __future__ import annotations
 
@@ -73,3 +73,22 @@ def _fill(start, stop, rgba, depth, limit, top, left, around, agreement, free, f
             rgba[row, column, 3] = alpha
             depth[row, column] = along / count
             filled[i, j] = True
+
+
+def cover(
+    corners: np.ndarray, near: np.ndarray, far: np.ndarray, shape: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """As the reference."""
+    least, most = np.full(shape, np.inf, np.float32), np.full(shape, -np.inf, np.float32)
+    _cover(np.ascontiguousarray(corners, np.int64), near.astype(np.float32),
+           far.astype(np.float32), least, most)  # fmt: skip
+    return least, most
+
+
+@njit(**OPTIONS)
+def _cover(corners, near, far, least, most):
+    for i in range(len(corners)):
+        for row in range(corners[i, 1], corners[i, 3]):
+            for column in range(corners[i, 0], corners[i, 2]):
+                least[row, column] = min(least[row, column], near[i])
+                most[row, column] = max(most[row, column], far[i])

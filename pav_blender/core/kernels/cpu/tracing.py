@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numba import njit
 
-from ..reference.bricks import MAP, SLACK
+from ..reference.bricks import FOOT, MAP, SLACK
 from ..structures import Clearance, PosedMesh, Probing, Traced, Voxels
 from .fields import (
     arrays_of,
@@ -28,11 +28,12 @@ from .fields import (
 from .frozen import DISTANCE, PLACES, RESTING, ROOM, WEIGHTS
 from .lanes import LANES, fma, load, maximum, minimum, splat, splat_int, store
 from .marching import clear_cells, flat, locate, rows_of, walk
-from .picking import inverse, visit
+from .picking import beyond, inverse, visit
 from .search import LEAN, OPTIONS, STACK
 from .threads import run_chunks
+from .views import views_of
 
-__all__ = ["arrays_of", "known_density", "short_tables", "trace"]
+__all__ = ["arrays_of", "enter", "known_density", "short_tables", "trace"]
 
 GROUP = 256  # rays that advance together
 _NONE, _WANTED = -1, -2
@@ -53,6 +54,84 @@ def _look_up(start, stop, cells, guide, out):
         out[i] = guide[cells[i]] if cells[i] >= 0 else np.float32(-1)
 
 
+def enter(
+    voxels: Voxels,
+    known: torch.Tensor,
+    origins: torch.Tensor,
+    directions: torch.Tensor,
+    near: torch.Tensor,
+    far: torch.Tensor,
+    step: float,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """The lattice indices [R] int32 between which rays may meet anything, as `trace` takes them:
+    the first is a place in a voxel that holds something, or past the last. near, far [R]: metres
+    along each ray beyond which nothing counts."""
+    first, last = (torch.empty(len(origins), dtype=torch.int32) for _ in range(2))
+    run_chunks(
+        _enter,
+        len(origins),
+        1 << 14,
+        (rows_of(origins, np.float32), rows_of(directions, np.float32), np.float32(step)),
+        rows_of(near, np.float32),
+        rows_of(far, np.float32),
+        _space(voxels, known),
+        first.numpy(),
+        last.numpy(),
+    )
+    return first, last
+
+
+@njit(**OPTIONS)
+def _enter(start, stop, rays, nears, fars, space, out_first, out_last):
+    origins, directions, step = rays
+    bricks, brick_count, thin, corner, scale, _ = space
+    side = np.float32(brick_count) / scale
+    half, nothing = np.float32(0.5), np.float32(0)
+    for ray in range(start, stop):
+        near, far = max(nears[ray], nothing), fars[ray]
+        for axis in range(3):
+            o, d = origins[ray, axis] - corner[axis], directions[ray, axis]
+            if d == 0:
+                far = far if 0 <= o <= side else np.float32(-1)
+                continue
+            a, b = -o / d, (side - o) / d
+            near, far = max(near, min(a, b)), min(far, max(a, b))
+        first, last = 0, -1
+        if near <= far < np.inf:
+            first = np.int64(np.ceil(max(near / step - half, nothing)))
+            last = np.int64(np.floor(far / step - half))
+        ox = (origins[ray, 0] - corner[0]) * scale
+        oy = (origins[ray, 1] - corner[1]) * scale
+        oz = (origins[ray, 2] - corner[2]) * scale
+        dx, dy, dz = (
+            directions[ray, 0] * scale,
+            directions[ray, 1] * scale,
+            directions[ray, 2] * scale,
+        )
+        over = inverse(dx), inverse(dy), inverse(dz)
+        while first <= last:
+            t = (np.float32(first) + half) * step
+            x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
+            voxel, clear = visit(x, y, z, *over, bricks, brick_count)
+            if voxel >= 0:
+                if thin[voxel] >= 0:
+                    break
+                clear = beyond(x, y, z, *over)
+            first += 1 + max(np.int64(min(clear / step, np.float32(last - first))), 0)
+        out_first[ray], out_last[ray] = first, last
+
+
+def _space(voxels: Voxels, known: torch.Tensor) -> tuple[Any, ...]:
+    return (
+        rows_of(voxels.bricks.view(-1), np.int32),
+        len(voxels.bricks),
+        flat(known),
+        flat(voxels.box_min),
+        np.float32(voxels.scale),
+        flat(voxels.maps),
+    )
+
+
 def trace(
     mesh: PosedMesh,
     voxels: Voxels,
@@ -67,7 +146,8 @@ def trace(
     clearance: Clearance,
     band: float,
     still: torch.Tensor,
-    views: torch.Tensor,
+    rotation: torch.Tensor,
+    view: torch.Tensor,
     probing: Probing,
 ) -> Traced:
     """Rays [R] to their ends, on this thread alone.
@@ -75,28 +155,22 @@ def trace(
     known [B, 4, 4, 4]: the density (1/m) that a guide knows of in each voxel, negative where
     nothing can be; field: what `arrays_of` makes of a `Frozen`; first, last [R] int32: the lattice
     indices to look at, places lying half a step further; band: metres from the mesh beyond which
-    nothing is; still [3, 4]: posed points to where the shoulders do not move; views [R, hidden]:
-    what a ray's direction adds to the first layer of the colour.
+    nothing is; still [3, 4]: posed points to where the shoulders do not move; rotation [3, 3],
+    view [16, hidden]: the head's, and what harmonics of a direction in its axes add to the first
+    layer of the colour.
     """
     count = len(origins)
     traced = Traced(torch.zeros(count, 4), torch.zeros(count), torch.ones(count), 0)
     half = torch.full((count,), 0.5)
     walked = walk(mesh, origins, directions, first, last, half, step, clearance, band)
-    space = (
-        rows_of(voxels.bricks.view(-1), np.int32),
-        len(voxels.bricks),
-        flat(known),
-        flat(voxels.box_min),
-        np.float32(voxels.scale),
-        flat(voxels.maps),
-    )
+    space = _space(voxels, known)
     unit = flat(clearance.box_min), np.float32(clearance.box_scale)
     evaluations = _trace(
         count,
         walked,
         space,
         (*unit, rows_of(still, np.float32)),
-        _padded(views),
+        views_of(directions, rotation, view),
         field,
         (
             probing.width,
@@ -110,11 +184,6 @@ def trace(
         tuple(values.numpy() for values in traced[:3]),
     )
     return traced._replace(evaluations=evaluations)
-
-
-def _padded(rows: torch.Tensor) -> np.ndarray:
-    """Rows [R, N] with zeros to the next whole vector."""
-    return rows_of(torch.nn.functional.pad(rows, (0, -rows.shape[1] % LANES)), np.float32)
 
 
 @njit(**LEAN)
@@ -138,9 +207,12 @@ def _runs(ray, first, last, rays, space, left, lengths_of, begins,
     while k <= last:
         t = (np.float32(k) + np.float32(0.5)) * step
         k += 1
-        voxel, clear = visit(ox + t * dx, oy + t * dy, oz + t * dz, *over, bricks, brick_count)
+        x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
+        voxel, clear = visit(x, y, z, *over, bricks, brick_count)
         density = thin[voxel] if voxel >= 0 else np.float32(-1)
         if density < 0:
+            if voxel >= 0:
+                clear = beyond(x, y, z, *over)
             k += max(np.int64(min(clear / step, np.float32(last - k))), 0)
             continue
         more = left * min(density * step, np.float32(1))
@@ -163,16 +235,21 @@ def _runs(ray, first, last, rays, space, left, lengths_of, begins,
 
 
 @njit(**LEAN)
-def _filled_near(x, y, z, voxels, grid):
-    """Whether there may be anything at a posed place, by the map of the brick that it is in: a look
-    at a table, which spares most of the searches that would find nothing."""
-    bricks, brick_count, maps, corner, scale = voxels
-    cells, size, grid_corner, grid_scale = grid
+def _brick_at(x, y, z, voxels):
+    """The row of the brick that a posed place is in, below 0 where there is none."""
+    bricks, brick_count, _, corner, scale = voxels
     far = brick_count - 1  # by rounding, a place on the last brick's face may lie beyond it
     u = min(np.int64((x - corner[0]) * scale), far)
     v = min(np.int64((y - corner[1]) * scale), far)
     w = min(np.int64((z - corner[2]) * scale), far)
-    row = bricks[(u * brick_count + v) * brick_count + w]
+    return bricks[(u * brick_count + v) * brick_count + w]
+
+
+@njit(**LEAN)
+def _filled_near(x, y, z, row, maps, grid):
+    """Whether there may be anything at a posed place, by the map of the brick that it is in: a look
+    at a table, which spares most of the searches that would find nothing."""
+    cells, size, grid_corner, grid_scale = grid
     if row < 0:
         return True
     at = row * MAP
@@ -207,9 +284,11 @@ def _filled_near(x, y, z, voxels, grid):
 
 
 @njit(**LEAN)
-def _point_at(start, stop, base, asked, rays, voxels, grid, points, wanted):
-    """Places [3, N] of those of requests start..stop where there may be anything, and which
-    requests these are; returns how many."""
+def _point_at(start, stop, base, asked, rays, voxels, grid, feet, points, wanted):
+    """Places [6, N] of those of requests start..stop where there may be anything, with a point of
+    the mesh near each, and which requests these are; returns how many. feet [G, 3]: each ray's last
+    nearest point."""
+    maps = voxels[2]
     origins, directions, step = rays
     want_row, want_k, sample_of = asked[0], asked[1], asked[2]
     count = 0
@@ -220,12 +299,24 @@ def _point_at(start, stop, base, asked, rays, voxels, grid, points, wanted):
         x = origins[ray, 0] + t * directions[ray, 0]
         y = origins[ray, 1] + t * directions[ray, 1]
         z = origins[ray, 2] + t * directions[ray, 2]
-        if _filled_near(x, y, z, voxels, grid):
-            points[0, count], points[1, count], points[2, count] = x, y, z
-            wanted[count] = request
-            count += 1
+        brick = _brick_at(x, y, z, voxels)
+        if not _filled_near(x, y, z, brick, maps, grid):
+            continue
+        points[0, count], points[1, count], points[2, count] = x, y, z
+        row = want_row[request]
+        u, v, w = feet[row, 0], feet[row, 1], feet[row, 2]
+        if brick >= 0:
+            at = brick * MAP + FOOT
+            a, b, c = maps[at], maps[at + 1], maps[at + 2]
+            there = (a - x) ** 2 + (b - y) ** 2 + (c - z) ** 2
+            if not (u - x) ** 2 + (v - y) ** 2 + (w - z) ** 2 < there:
+                u, v, w = a, b, c
+        points[3, count], points[4, count], points[5, count] = u, v, w
+        wanted[count] = request
+        count += 1
     for i in range(count, -(-count // LANES) * LANES):  # a whole packet
-        points[0, i], points[1, i], points[2, i] = points[:, count - 1]
+        for axis in range(6):
+            points[axis, i] = points[axis, count - 1]
     return count
 
 
@@ -242,11 +333,8 @@ def _find(requests, wanted, points, asked, count, surface, grid, frames, feet, s
     zero, one = splat(0.0), splat(1.0)
     for begin in range(0, requests, LANES):
         lanes = min(LANES, requests - begin)
-        for i in range(lanes):
-            row = want_row[wanted[begin + i]]
-            if feet[row, 0] < np.inf:  # else a neighbour's nearest point is a bound as well
-                for axis in range(3):
-                    near[axis * LANES + i] = feet[row, axis]
+        for axis in range(3):
+            store(near, axis * LANES, load(points[3 + axis], begin))
         px, py, pz = load(points[0], begin), load(points[1], begin), load(points[2], begin)
         locate(arrays, triangle_maps, vertex_maps, vertices, mesh_corners, px, py, pz,
                splat_int(0) < splat_int(1), band, stack, scratch, near, found, weights, canonical,
@@ -412,7 +500,7 @@ def _trace(total, walked, space, frames, views, field, lengths_of, limits, outpu
     # triangles; canonical places in the unit box, those that rest with the shoulders, barycentrics,
     # distances (`frozen`)
     samples = np.zeros(room, np.int32), np.zeros((PLACES, room), np.float32)
-    points, wanted = np.zeros((3, most + LANES), np.float32), np.zeros(most, np.int32)
+    points, wanted = np.zeros((6, most + LANES), np.float32), np.zeros(most, np.int32)
     packet = (
         np.empty(STACK, np.int32),
         np.empty(LANES, np.float32),
@@ -435,7 +523,7 @@ def _trace(total, walked, space, frames, views, field, lengths_of, limits, outpu
     for base in range(0, total, GROUP):
         living = 0
         for i in range(min(GROUP, total - base)):
-            feet[i, 0] = np.inf
+            feet[i] = np.inf
             if first[base + i] <= last[base + i]:
                 alive[living] = i
                 living += 1
@@ -457,7 +545,8 @@ def _trace(total, walked, space, frames, views, field, lengths_of, limits, outpu
                 else:
                     break
                 begin = count
-                found = _point_at(known, requests, base, asked, rays, voxels, grid, points, wanted)
+                found = _point_at(known, requests, base, asked, rays, voxels, grid, feet, points,
+                                  wanted)  # fmt: skip
                 count = _find(found, wanted, points, asked, begin, surface, grid, frames, feet,
                               samples, packet)  # fmt: skip
                 densities(begin, count, field, mesh_corners, samples, features, inputs, sigma,

@@ -2,7 +2,7 @@
 the cells that a brick's voxels lie in. See `deformation/voxels.py`.
 
 A brick's map is a row of sixteen: an affine map [3, 4] from posed to canonical space, then how far
-it may be off and what makes the row whole (`Voxels`).
+it may be off and the nearest point of the mesh (`Voxels`).
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from .nearest import nearest
 BRICK = 4  # voxels a side
 MAP = 16  # numbers of a brick's map
 SLACK = 12  # its column that says how far the map may be off
+FOOT = 13  # and from where on the nearest point of the mesh to the brick's middle is written
 TORN = 0.004  # metres between where two bricks' maps take a place, from which they are torn
 FAR = 0.012  # metres of a leap from which the map of a larger cube tells nothing of its parts
 
@@ -75,7 +76,7 @@ def brick_maps(mesh: PosedMesh, found: Found, middles: torch.Tensor) -> torch.Te
         linear = (mesh.vertex_maps[corners, :, :3] * weights).sum(1)
     moved = found.canonical[..., None] - linear @ middles[..., None]
     rows = torch.cat([linear, moved], 2).view(-1, SLACK)
-    return torch.nn.functional.pad(rows, (0, MAP - SLACK))
+    return torch.cat([rows, torch.zeros_like(rows[:, :1]), found.foot], 1)
 
 
 def _linear(maps: torch.Tensor) -> torch.Tensor:

@@ -63,3 +63,16 @@ def _extent(values: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     for value in values[1:]:
         low, high = np.minimum(low, value), np.maximum(high, value)
     return low, high
+
+
+def cover(
+    corners: np.ndarray, near: np.ndarray, far: np.ndarray, shape: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """The least of near [N] and the greatest of far [N] of the rectangles that cover each place of
+    a grid of this shape; infinite, and below that, where none does. corners [N, 4]: first column
+    and row, and those beyond the last."""
+    least, most = np.full(shape, np.inf, np.float32), np.full(shape, -np.inf, np.float32)
+    for (left, top, right, bottom), low, high in zip(corners, near, far, strict=True):
+        np.minimum(part := least[top:bottom, left:right], low, out=part)
+        np.maximum(part := most[top:bottom, left:right], high, out=part)
+    return least, most
