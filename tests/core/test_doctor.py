@@ -9,10 +9,10 @@ from pathlib import Path
 CODE = """
 from pav_blender.cli import main
 from pav_blender.core.kernels.cpu import batches, bricks, encoding, frames, marching, nearest
-from pav_blender.core.kernels.cpu import networks, optimiser, picking, tracing
+from pav_blender.core.kernels.cpu import following, networks, optimiser, picking, tracing
 kernels = (picking._pick, picking._follow, marching._march, nearest._nearest, tracing._trace,
-           tracing._look_up, frames._linear_parts, bricks._look, bricks._brick_cells,
-           bricks._add_torn, bricks._likely,
+           following._look_up, following._enter, frames._linear_parts, bricks._look,
+           bricks._brick_cells, bricks._add_torn, bricks._likely,
            networks._forward, networks._backward, encoding._encode_levels,
            encoding._adam_level, optimiser.adam_range, batches._gather, batches._watch)
 assert not any(kernel.signatures for kernel in kernels)

@@ -1,0 +1,156 @@
+"""Along rays through the voxels of a pose: where something may begin, and runs of places."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numba import njit
+
+from ..structures import Voxels
+from .marching import flat, rows_of
+from .picking import beyond, inverse, visit
+from .search import LEAN, OPTIONS
+from .threads import run_chunks
+
+
+def known_density(voxels: Voxels, guide: torch.Tensor) -> torch.Tensor:
+    """What a guide [G, G, G] knows of the density in each voxel [B, 4, 4, 4], -1 where it has no
+    cell."""
+    found = torch.empty(voxels.cells.shape)
+    cells = rows_of(voxels.cells.view(-1), np.int32)
+    run_chunks(_look_up, len(cells), 1 << 16, cells, flat(guide), found.view(-1).numpy())
+    return found
+
+
+@njit(**OPTIONS)
+def _look_up(start, stop, cells, guide, out):
+    for i in range(start, stop):
+        out[i] = guide[cells[i]] if cells[i] >= 0 else np.float32(-1)
+
+
+def enter(
+    voxels: Voxels,
+    known: torch.Tensor,
+    origins: torch.Tensor,
+    directions: torch.Tensor,
+    near: torch.Tensor,
+    far: torch.Tensor,
+    step: float,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """The lattice indices [R] int32 between which rays may meet anything, as `trace` takes them:
+    the first is a place in a voxel that holds something, or past the last. near, far [R]: metres
+    along each ray beyond which nothing counts."""
+    first, last = (torch.empty(len(origins), dtype=torch.int32) for _ in range(2))
+    run_chunks(
+        _enter,
+        len(origins),
+        1 << 14,
+        (rows_of(origins, np.float32), rows_of(directions, np.float32), np.float32(step)),
+        rows_of(near, np.float32),
+        rows_of(far, np.float32),
+        space_of(voxels, known),
+        first.numpy(),
+        last.numpy(),
+    )
+    return first, last
+
+
+@njit(**OPTIONS)
+def _enter(start, stop, rays, nears, fars, space, out_first, out_last):
+    origins, directions, step = rays
+    bricks, brick_count, thin, corner, scale, _ = space
+    side = np.float32(brick_count) / scale
+    half, nothing = np.float32(0.5), np.float32(0)
+    for ray in range(start, stop):
+        near, far = max(nears[ray], nothing), fars[ray]
+        for axis in range(3):
+            o, d = origins[ray, axis] - corner[axis], directions[ray, axis]
+            if d == 0:
+                far = far if 0 <= o <= side else np.float32(-1)
+                continue
+            a, b = -o / d, (side - o) / d
+            near, far = max(near, min(a, b)), min(far, max(a, b))
+        first, last = 0, -1
+        if near <= far < np.inf:
+            first = np.int64(np.ceil(max(near / step - half, nothing)))
+            last = np.int64(np.floor(far / step - half))
+        ox = (origins[ray, 0] - corner[0]) * scale
+        oy = (origins[ray, 1] - corner[1]) * scale
+        oz = (origins[ray, 2] - corner[2]) * scale
+        dx, dy, dz = (
+            directions[ray, 0] * scale,
+            directions[ray, 1] * scale,
+            directions[ray, 2] * scale,
+        )
+        over = inverse(dx), inverse(dy), inverse(dz)
+        while first <= last:
+            t = (np.float32(first) + half) * step
+            x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
+            voxel, clear = visit(x, y, z, *over, bricks, brick_count)
+            if voxel >= 0:
+                if thin[voxel] >= 0:
+                    break
+                clear = beyond(x, y, z, *over)
+            first += 1 + max(np.int64(min(clear / step, np.float32(last - first))), 0)
+        out_first[ray], out_last[ray] = first, last
+
+
+def space_of(voxels: Voxels, known: torch.Tensor) -> tuple[Any, ...]:
+    return (
+        rows_of(voxels.bricks.view(-1), np.int32),
+        len(voxels.bricks),
+        flat(known),
+        flat(voxels.box_min),
+        np.float32(voxels.scale),
+        flat(voxels.maps),
+    )
+
+
+@njit(**LEAN)
+def runs_of(ray, first, last, rays, space, left, lengths_of, begins,
+            lengths):  # fmt: skip
+    """Places of one ray in runs, each looked at in its middle: how many runs, where to go on.
+
+    A run is up to `probe` places that are in some cell, or up to `longest` that add no more than
+    `share` to the pixel by the guide.
+    """
+    origins, directions, step = rays
+    bricks, brick_count, thin, corner, scale, _ = space
+    width, share, longest, probe = lengths_of
+    ox = (origins[ray, 0] - corner[0]) * scale
+    oy = (origins[ray, 1] - corner[1]) * scale
+    oz = (origins[ray, 2] - corner[2]) * scale
+    dx, dy, dz = directions[ray, 0] * scale, directions[ray, 1] * scale, directions[ray, 2] * scale
+    over = inverse(dx), inverse(dy), inverse(dz)
+    count, length, added = -1, 0, np.float32(0.0)
+    k = first
+    while k <= last:
+        t = (np.float32(k) + np.float32(0.5)) * step
+        k += 1
+        x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
+        voxel, clear = visit(x, y, z, *over, bricks, brick_count)
+        density = thin[voxel] if voxel >= 0 else np.float32(-1)
+        if density < 0:
+            if voxel >= 0:
+                clear = beyond(x, y, z, *over)
+            k += max(np.int64(min(clear / step, np.float32(last - k))), 0)
+            continue
+        more = left * min(density * step, np.float32(1))
+        together = (
+            length > 0
+            and begins[count] + length == k - 1
+            and (length < probe or (length < longest and added + more <= share))
+        )
+        if together:
+            length += 1
+            added += more
+            lengths[count] = length
+            continue
+        if count + 1 == width:
+            return width, k - 1
+        count += 1
+        begins[count], lengths[count] = k - 1, 1
+        length, added = 1, more
+    return count + 1, k
