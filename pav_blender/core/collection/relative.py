@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
 from ..head import HeadModel
@@ -17,6 +16,8 @@ OTHER_PERSON = 0.002  # metres: fits of one person lie nearer, see identity_dist
 def identity_distance(head: HeadModel, first: np.ndarray, second: np.ndarray) -> float:
     """How far two neutral heads [V, 3] lie apart, metres: the mean over the face (the whole mesh
     without one), after the rigid move that fits them best."""
+    from scipy.spatial.transform import Rotation  # here: it takes a seventh of a second to load
+
     face = head.regions.get("face")
     rows = face if face is not None and face.any() else np.ones(len(first), bool)
     a, b = first[rows].astype(np.float64), second[rows].astype(np.float64)
@@ -34,6 +35,8 @@ def relative_clip(clip: Clip, neutral: int | None = None) -> Clip:
     Vertices beyond the parameters are the other person's, and are left out. InputError where the
     clip has no such frame.
     """
+    from scipy.spatial.transform import Rotation
+
     if neutral is None:
         expression, pose, translation = (
             np.median(values, axis=0) for values in (clip.expression, clip.pose, clip.translation)
