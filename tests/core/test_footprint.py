@@ -33,7 +33,7 @@ def cameras(toy):
     filmed = camera_of(toy.clip("plain"), 7).resized(72, 72)
     near = filmed.camera_to_world.copy()
     near[:3, 3] -= 0.2 * near[:3, 2]
-    scale = np.array([[300.0, 0, 36], [0, 300, 36], [0, 0, 1]])
+    scale = np.array([[120.0, 0, 36], [0, 120, 36], [0, 0, 1]])
     skewed = filmed.intrinsics + np.array([[0, 15.0, 0], [0, 0, 0], [0, 0, 0]])
     return {
         "filmed": filmed,

@@ -38,10 +38,8 @@ def voxels(mesh: PosedMesh, space: Clearance, reach: float) -> Voxels:
     near = _near(mesh, space, reach, low, places, far, _SIDES[0])
     for size in _SIDES[1:]:
         near = _near(mesh, space, reach, low, *_parts(mesh, space, near, size), size)
-    places = near.places
-    cells, maps = _brick_cells(mesh, space, near)
-    held = (cells.amax(1) >= 0).nonzero()[:, 0]
-    places, cells, maps = places[held], cells[held], maps[held]
+    rows, cells, maps = _brick_cells(mesh, space, near)
+    places = near.places[rows]
     corner = places.amin(0) if len(places) else torch.zeros(3, dtype=torch.int32)
     count = int((places - corner).max()) + 1 if len(places) else 1
     filled = torch.zeros((count,) * 3, dtype=torch.bool)
@@ -110,20 +108,24 @@ def _parts(
 
 def _brick_cells(
     mesh: PosedMesh, space: Clearance, bricks: _Cubes
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Canonical cells [N, 64] of bricks, and their maps [N, 16] (`Voxels`). Within a brick the map
-    is as good as affine, but for bricks in which the nearest point leaps from one part of the mesh
-    to another: their voxels may lie where a neighbour's map takes them as well."""
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Rows [M] of bricks that may hold something, their canonical cells [M, 64] and their maps
+    [M, 16] (`Voxels`). Within a brick the map is as good as affine, but for bricks in which the
+    nearest point leaps from one part of the mesh to another: their voxels may lie where a
+    neighbour's map takes them as well."""
     ops, found = kernels.select("cpu").bricks, bricks.found
     margin = _cells(_CORNER * BRICK * _VOXEL, space)
     maps = ops.brick_maps(mesh, found, bricks.middles)
-    cells = ops.brick_cells(found, maps, space, _VOXEL, margin)
-    if len(cells):
-        cubes = *_grid_of(bricks.places), found.canonical, maps
-        ops.add_torn(cells, *cubes, space, _VOXEL, margin)
-        leaps = ops.leaps(*cubes, BRICK * _VOXEL)
-        maps[:, SLACK] = torch.where(leaps > TORN, torch.inf, leaps + _SLACK)
-    return cells, maps
+    if not len(maps):
+        return torch.zeros(0, dtype=torch.int64), torch.zeros(0, BRICK**3, dtype=torch.int32), maps
+    cubes = *_grid_of(bricks.places), found.canonical, maps
+    leaps = ops.leaps(*cubes, BRICK * _VOXEL)
+    rows = ((found.clear <= margin) | (leaps > TORN)).nonzero()[:, 0]
+    cells = ops.brick_cells(rows, found, maps, space, _VOXEL, margin)
+    ops.add_torn(cells, rows, *cubes, space, _VOXEL, margin)
+    maps, leaps = maps[rows], leaps[rows]
+    maps[:, SLACK] = torch.where(leaps > TORN, torch.inf, leaps + _SLACK)
+    return rows, cells, maps
 
 
 def _grid_of(places: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

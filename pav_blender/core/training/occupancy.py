@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from scipy import ndimage
 
 from .. import kernels
 from ..deformation import Clearance, Deformer
@@ -114,29 +113,40 @@ class Visibility:
         if size % 2:
             return
         shape = (-1, size // 2, 2, size // 2, 2, size // 2, 2)
-        looks, weight = self.looks.view(shape), self.weight.view(shape)
-        judged = looks.sum((2, 4, 6), keepdim=True) >= _BLOCK_LOOKS
-        filled = weight.amax((2, 4, 6), keepdim=True) >= _LEAST_WEIGHT
+        blocks = (len(self.occupied), *(size // 2, 1) * 3)
+        looks, weight = (x.view(self.occupied.shape) for x in (self.looks, self.weight))
+        judged = (torch.nn.functional.avg_pool3d(looks, 2) * 8 >= _BLOCK_LOOKS).view(blocks)
+        filled = (torch.nn.functional.max_pool3d(weight, 2) >= _LEAST_WEIGHT).view(blocks)
         self.filled.view(shape).logical_and_(filled | ~judged)
-        weight.mul_(~judged)
-        looks.mul_(~judged)
+        for values in (looks, weight):
+            values.view(shape).mul_(~judged)
 
     def prune(self) -> float:
         """Empties cells that were looked at and added nothing; returns the part that is left."""
         self.unseen += (self.unseen < 255) & (self.looks == 0)
         self.unseen[self.looks > 0] = 0
         judged = self.looks >= _LOOKS
-        self.filled[judged] = self.weight[judged] >= _LEAST_WEIGHT
+        self.filled = torch.where(judged, self.weight >= _LEAST_WEIGHT, self.filled)
         self._judge_blocks()
         shape = self.occupied.shape
         hidden = (self.unseen >= _HIDDEN).numpy().reshape(shape) & ~self._near
         filled = self.filled.numpy().reshape(shape) & ~hidden
-        for index, cells in enumerate(filled):  # a surface may move into a neighbour
-            self.occupied[index] &= ndimage.binary_dilation(cells)
+        self.occupied &= _grown(filled)  # a surface may move into a neighbour
         if self._one_geometry:  # what one appearance shows, the others cannot lack
             self.occupied[:] = self.occupied.any(axis=0)
-        self.weight[judged] = 0
-        self.looks[judged] = 0
+        self.weight.mul_(~judged)
+        self.looks.mul_(~judged)
         self._refresh()
         self._forget_emptied()
         return float(self.occupied.mean())
+
+
+def _grown(cells: np.ndarray) -> np.ndarray:
+    """Cells [A, G, G, G] and those that share a face with one."""
+    grown = cells.copy()
+    for axis in (1, 2, 3):
+        ahead, behind = [slice(None)] * 4, [slice(None)] * 4
+        ahead[axis], behind[axis] = slice(1, None), slice(None, -1)
+        grown[tuple(ahead)] |= cells[tuple(behind)]
+        grown[tuple(behind)] |= cells[tuple(ahead)]
+    return grown

@@ -168,14 +168,20 @@ def _brick_maps(start, stop, surface, triangle, barycentric, canonical, foot, mi
 
 
 def brick_cells(
-    found: Found, maps: torch.Tensor, space: Clearance, voxel: float, margin: int
+    rows: torch.Tensor,
+    found: Found,
+    maps: torch.Tensor,
+    space: Clearance,
+    voxel: float,
+    margin: int,
 ) -> torch.Tensor:
     """As the reference, up to the rounding of the places."""
-    cells = torch.empty((len(maps), _VOXELS), dtype=torch.int32)
+    cells = torch.empty((len(rows), _VOXELS), dtype=torch.int32)
     run_chunks(
         _brick_cells,
         len(cells),
         512,
+        rows_of(rows, np.int64),
         rows_of(found.canonical, np.float32),
         rows_of(found.clear, np.float32),
         rows_of(maps, np.float32),
@@ -226,14 +232,15 @@ def _fill(out, at, x, y, z, maps, brick, grid, offsets, scratch):
 
 
 @njit(**OPTIONS)
-def _brick_cells(start, stop, canonical, clear, maps, grid, offsets, margin, out):
+def _brick_cells(start, stop, rows, canonical, clear, maps, grid, offsets, margin, out):
     scratch = np.empty(LANES, np.int32)
-    for brick in range(start, stop):
+    for number in range(start, stop):
+        brick = rows[number]
         for i in range(0, _VOXELS, LANES):
-            store(out, brick * _VOXELS + i, splat_int(-1))
+            store(out, number * _VOXELS + i, splat_int(-1))
         if clear[brick] <= margin:
             x, y, z = canonical[brick, 0], canonical[brick, 1], canonical[brick, 2]
-            _fill(out, brick * _VOXELS, x, y, z, maps, brick, grid, offsets, scratch)
+            _fill(out, number * _VOXELS, x, y, z, maps, brick, grid, offsets, scratch)
 
 
 def leaps(
@@ -331,6 +338,7 @@ def _likely(start, stop, canonical, maps, leaps, grid, quarter, margin, out):
 
 def add_torn(
     cells: torch.Tensor,
+    rows: torch.Tensor,
     at: torch.Tensor,
     places: torch.Tensor,
     canonical: torch.Tensor,
@@ -344,6 +352,7 @@ def add_torn(
         _add_torn,
         len(cells),
         2048,
+        rows_of(rows, np.int64),
         *_cubes(at, places, canonical, maps, BRICK * voxel),
         grid_of(space),
         _offsets(voxel),
@@ -353,10 +362,11 @@ def add_torn(
 
 
 @njit(**OPTIONS)
-def _add_torn(start, stop, at, places, canonical, maps, side, grid, offsets, margin, out):
+def _add_torn(start, stop, rows, at, places, canonical, maps, side, grid, offsets, margin, out):
     scratch = np.empty(LANES, np.int32)
-    for brick in range(start, stop):
+    for number in range(start, stop):
+        brick = rows[number]
         for direction in range(6):
             beside, x, y, z, leap = _beside(at, places, canonical, maps, side, brick, direction)
             if leap > np.float32(TORN) and _cell_near(grid, x, y, z) <= margin:
-                _fill(out, brick * _VOXELS, x, y, z, maps, beside, grid, offsets, scratch)
+                _fill(out, number * _VOXELS, x, y, z, maps, beside, grid, offsets, scratch)

@@ -101,15 +101,22 @@ def _in_grid(canonical: torch.Tensor, space: Clearance) -> tuple[torch.Tensor, t
 
 
 def brick_cells(
-    found: Found, maps: torch.Tensor, space: Clearance, voxel: float, margin: int
+    rows: torch.Tensor,
+    found: Found,
+    maps: torch.Tensor,
+    space: Clearance,
+    voxel: float,
+    margin: int,
 ) -> torch.Tensor:
-    """Canonical cells [N, 64] int32 of the voxels of bricks, -1 where no occupied cell is beside.
+    """Canonical cells [M, 64] int32 of the voxels of some bricks, -1 where no occupied cell is
+    beside.
 
-    found: of the bricks' middles; maps [N, 16], taken to hold over the brick; voxel: side in
-    metres; margin: cells from an occupied one beyond which nothing in a brick can be.
+    rows [M]: which bricks; found: of all their middles; maps [N, 16], taken to hold over the brick;
+    voxel: side in metres; margin: cells from an occupied one beyond which nothing in a brick can
+    be.
     """
-    cells = _cells_about(found.canonical, _linear(maps), space, voxel)
-    return torch.where((found.clear <= margin)[:, None], cells, -1)
+    cells = _cells_about(found.canonical[rows], _linear(maps)[rows], space, voxel)
+    return torch.where((found.clear[rows] <= margin)[:, None], cells, -1)
 
 
 def _cells_about(
@@ -157,6 +164,7 @@ def likely(
 
 def add_torn(
     cells: torch.Tensor,
+    rows: torch.Tensor,
     at: torch.Tensor,
     places: torch.Tensor,
     canonical: torch.Tensor,
@@ -166,15 +174,18 @@ def add_torn(
     margin: int,
 ) -> None:
     """Where the nearest point leaps from one part of a mesh to another between two bricks, the
-    map of each may hold in part of the other: cells [N, 64] are set, in place, where they have
-    none, to what the maps of torn neighbours say. The rest as in `leaps` and `brick_cells`."""
+    map of each may hold in part of the other: cells [M, 64] of bricks rows [M] are set, in place,
+    where they have none, to what the maps of torn neighbours say. The rest as in `leaps` and
+    `brick_cells`."""
     linear = _linear(maps)
+    place = torch.full((len(maps),), -1, device=rows.device)
+    place[rows] = torch.arange(len(rows), device=rows.device)
     for bricks, beside, there in _about(at, places, canonical, maps, BRICK * voxel):
         torn = (there - canonical[bricks]).abs().amax(1) > TORN
-        torn &= cells_from_occupied(there, space) <= margin
-        bricks, beside, there = bricks[torn], beside[torn], there[torn]
+        torn &= (cells_from_occupied(there, space) <= margin) & (place[bricks] >= 0)
+        own, beside, there = place[bricks[torn]], beside[torn], there[torn]
         found = _cells_about(there, linear[beside], space, voxel)
-        cells[bricks] = torch.where(cells[bricks] < 0, found, cells[bricks])
+        cells[own] = torch.where(cells[own] < 0, found, cells[own])
 
 
 def _about(
