@@ -127,7 +127,7 @@ def test_rays_enter_where_the_first_voxel_holds_something(toy, scene):
         x, y, z = at.long().clamp(0, size - 1).unbind(1)
         row = voxels.bricks[x, y, z].long()
         u, v, w = ((at - at.floor()) * 4).long().unbind(1)
-        held = inside & (row >= 0) & (known[row.clamp(min=0), u, v, w] >= 0)
+        held = inside & (row >= 0) & (known.density[row.clamp(min=0), u, v, w] >= 0)
         k = held.nonzero()[:, 0]
         if len(k) == 0:
             assert first[ray] > last[ray]
@@ -136,6 +136,15 @@ def test_rays_enter_where_the_first_voxel_holds_something(toy, scene):
         assert abs(int(first[ray]) - int(k[0])) <= 1  # by rounding
         assert last[ray] >= k[-1] - 1
     assert hit > 20
+
+
+def test_what_is_known_of_voxels(scene):
+    density, held = scene.known
+    cells = scene.voxels.cells.long()
+    want = torch.where(cells >= 0, scene.wearing.guide.view(-1)[cells.clamp(min=0)], -1.0)
+    torch.testing.assert_close(density, want, rtol=0, atol=0)
+    bits = (held[:, None] >> torch.arange(64)) & 1
+    assert torch.equal(bits.bool(), cells.view(-1, 64) >= 0)
 
 
 def test_cover_as_the_reference():

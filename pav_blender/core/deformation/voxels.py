@@ -39,14 +39,15 @@ def voxels(mesh: PosedMesh, space: Clearance, reach: float) -> Voxels:
     for size in _SIDES[1:]:
         near = _near(mesh, space, reach, low, *_parts(mesh, space, near, size), size)
     rows, cells, maps = _brick_cells(mesh, space, near)
-    places = near.places[rows]
+    held = (cells.amax(1) >= 0).nonzero()[:, 0]  # few are not: they stay, and nothing leads there
+    places = near.places[rows[held]]
     corner = places.amin(0) if len(places) else torch.zeros(3, dtype=torch.int32)
     count = int((places - corner).max()) + 1 if len(places) else 1
     filled = torch.zeros((count,) * 3, dtype=torch.bool)
     at = (places - corner).long().unbind(1)
     filled[at] = True
     bricks = -torch.from_numpy(clearance(filled.numpy())).int()
-    bricks[at] = torch.arange(len(places), dtype=torch.int32)
+    bricks[at] = held.int()
     shape = (-1, BRICK, BRICK, BRICK)
     side = BRICK * _VOXEL
     return Voxels(bricks, cells.view(shape), low + corner * side, 1 / side, maps)

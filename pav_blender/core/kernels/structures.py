@@ -73,6 +73,14 @@ class Voxels:
         return torch.stack([self.box_min, self.box_min + len(self.bricks) / self.scale])
 
 
+class Known(NamedTuple):
+    """What a guide knows of `Voxels`: density [B, 4, 4, 4] (1/m), negative where nothing can be;
+    held [B] int64: a bit for each voxel where something can, the last index counting by ones."""
+
+    density: torch.Tensor
+    held: torch.Tensor
+
+
 class Thrift(NamedTuple):
     """How few samples may stand for a ray's places; what a place adds is told by a guide.
 

@@ -21,7 +21,7 @@ from ..field.field import Samples, condition
 from ..field.frozen import freeze
 from ..field.mixture import geometry
 from ..kernels.cpu.threads import run_chunks, torch_alone
-from ..kernels.structures import Frozen, Picks, Probing, Traced, Wave
+from ..kernels.structures import Frozen, Known, Picks, Probing, Traced, Wave
 from .cameras import Camera
 from .footprint import footprint
 from .rays import RayBatch, camera_rays, pack, samples_of, tiled
@@ -136,7 +136,7 @@ class Scene:
         return self.wearing.space
 
     @cached_property
-    def known(self) -> torch.Tensor:
+    def known(self) -> Known:
         """What the guide knows of the density in each voxel."""
         return kernels.select("cpu").tracing.known_density(self.voxels, self.wearing.guide)
 
@@ -376,18 +376,16 @@ def _whole(scene: Scene, rays: RayBatch, settings: RenderSettings) -> Traced:
     first, last = ops.enter(
         scene.voxels, scene.known, rays.origins, rays.directions, begin, end, settings.step
     )
-    seen = (first <= last).nonzero()[:, 0]  # most of a picture is empty
-    origins, directions = rays.origins[seen], rays.directions[seen]
     still = np.concatenate([stance.shoulders.T, stance.offset[:, None]], 1)
-    traced = ops.trace(
+    return ops.trace(
         scene.mesh,
         scene.voxels,
         scene.known,
         _field(scene, settings),
-        origins,
-        directions,
-        first[seen],
-        last[seen],
+        rays.origins,
+        rays.directions,
+        first,
+        last,
         settings.step,
         clearance=scene.clearance,
         band=scene.avatar.config.reach,
@@ -404,10 +402,6 @@ def _whole(scene: Scene, rays: RayBatch, settings: RenderSettings) -> Traced:
             settings.negligible,
         ),
     )
-    whole = Traced(torch.zeros(count, 4), torch.zeros(count), torch.ones(count), traced.evaluations)
-    for values, found in zip(whole[:3], traced[:3], strict=True):
-        values[seen] = found
-    return whole
 
 
 def _by_waves(scene: Scene, rays: RayBatch, settings: RenderSettings) -> Traced:

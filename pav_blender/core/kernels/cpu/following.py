@@ -8,31 +8,74 @@ import numpy as np
 import torch
 from numba import njit
 
-from ..structures import Voxels
+from ..reference.bricks import BRICK
+from ..structures import Known, Voxels
 from .marching import flat, rows_of
-from .picking import beyond, inverse, visit
+from .picking import inverse, leave
 from .search import LEAN, OPTIONS
 from .threads import run_chunks
 
+_VOXELS = BRICK**3
+_OCTANT = 0x330033  # the bits of a brick's first eight voxels, 2 x 2 x 2
 
-def known_density(voxels: Voxels, guide: torch.Tensor) -> torch.Tensor:
-    """What a guide [G, G, G] knows of the density in each voxel [B, 4, 4, 4], -1 where it has no
-    cell."""
-    found = torch.empty(voxels.cells.shape)
-    cells = rows_of(voxels.cells.view(-1), np.int32)
-    run_chunks(_look_up, len(cells), 1 << 16, cells, flat(guide), found.view(-1).numpy())
-    return found
+
+def known_density(voxels: Voxels, guide: torch.Tensor) -> Known:
+    """What a guide [G, G, G] knows of the density in each voxel."""
+    count = len(voxels.cells)
+    known = Known(torch.empty(voxels.cells.shape), torch.empty(count, dtype=torch.int64))
+    run_chunks(
+        _look_up,
+        count,
+        1 << 10,
+        rows_of(voxels.cells.view(count, -1), np.int32),
+        flat(guide),
+        known.density.view(count, -1).numpy(),
+        known.held.numpy(),
+    )
+    return known
 
 
 @njit(**OPTIONS)
-def _look_up(start, stop, cells, guide, out):
-    for i in range(start, stop):
-        out[i] = guide[cells[i]] if cells[i] >= 0 else np.float32(-1)
+def _look_up(start, stop, cells, guide, density, held):
+    for brick in range(start, stop):
+        bits = np.int64(0)
+        for i in range(_VOXELS):
+            cell = cells[brick, i]
+            density[brick, i] = guide[cell] if cell >= 0 else np.float32(-1)
+            bits |= np.int64(cell >= 0) << i
+        held[brick] = bits
+
+
+@njit(**LEAN)
+def _held_at(x, y, z, over, bricks, brick_count, held):
+    """The flat voxel of a place (x, y, z), in bricks, that holds something, or -1 and how far along
+    a direction, one over which is `over`, there will be nothing."""
+    nothing, one = np.float32(0), np.int64(1)
+    if not (min(x, y, z) >= 0 and max(x, y, z) < np.float32(brick_count)):
+        return np.int64(-1), nothing
+    u, v, w = np.int64(x), np.int64(y), np.int64(z)
+    row = np.int64(bricks[(u * brick_count + v) * brick_count + w])
+    if row < 0:  # up to where the ray leaves the bricks that are clear as well
+        return np.int64(-1), leave(x, y, z, u, v, w, over, -row)
+    i = np.int64((x - np.float32(u)) * BRICK)
+    j = np.int64((y - np.float32(v)) * BRICK)
+    k = np.int64((z - np.float32(w)) * BRICK)
+    bit = (i * BRICK + j) * BRICK + k
+    bits = held[row]
+    if (bits >> bit) & 1:
+        return row * _VOXELS + bit, nothing
+    side = np.float32(BRICK)
+    octant = ((i >> 1) * BRICK + (j >> 1)) * 2 * BRICK + (k >> 1) * 2
+    if bits & (np.int64(_OCTANT) << octant) == 0:
+        side = np.float32(BRICK // 2)
+    x, y, z = x * side, y * side, z * side
+    beyond = leave(x, y, z, np.int64(x), np.int64(y), np.int64(z), over, one)
+    return np.int64(-1), beyond / side
 
 
 def enter(
     voxels: Voxels,
-    known: torch.Tensor,
+    known: Known,
     origins: torch.Tensor,
     directions: torch.Tensor,
     near: torch.Tensor,
@@ -60,7 +103,7 @@ def enter(
 @njit(**OPTIONS)
 def _enter(start, stop, rays, nears, fars, space, out_first, out_last):
     origins, directions, step = rays
-    bricks, brick_count, thin, corner, scale, _ = space
+    bricks, brick_count, _, held, corner, scale, _ = space
     side = np.float32(brick_count) / scale
     half, nothing = np.float32(0.5), np.float32(0)
     for ray in range(start, stop):
@@ -88,20 +131,19 @@ def _enter(start, stop, rays, nears, fars, space, out_first, out_last):
         while first <= last:
             t = (np.float32(first) + half) * step
             x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
-            voxel, clear = visit(x, y, z, *over, bricks, brick_count)
+            voxel, clear = _held_at(x, y, z, over, bricks, brick_count, held)
             if voxel >= 0:
-                if thin[voxel] >= 0:
-                    break
-                clear = beyond(x, y, z, *over)
+                break
             first += 1 + max(np.int64(min(clear / step, np.float32(last - first))), 0)
         out_first[ray], out_last[ray] = first, last
 
 
-def space_of(voxels: Voxels, known: torch.Tensor) -> tuple[Any, ...]:
+def space_of(voxels: Voxels, known: Known) -> tuple[Any, ...]:
     return (
         rows_of(voxels.bricks.view(-1), np.int32),
         len(voxels.bricks),
-        flat(known),
+        flat(known.density),
+        known.held.numpy(),
         flat(voxels.box_min),
         np.float32(voxels.scale),
         flat(voxels.maps),
@@ -117,7 +159,7 @@ def runs_of(ray, first, last, rays, space, left, lengths_of, begins,
     `share` to the pixel by the guide.
     """
     origins, directions, step = rays
-    bricks, brick_count, thin, corner, scale, _ = space
+    bricks, brick_count, density, held, corner, scale, _ = space
     width, share, longest, probe = lengths_of
     ox = (origins[ray, 0] - corner[0]) * scale
     oy = (origins[ray, 1] - corner[1]) * scale
@@ -130,14 +172,11 @@ def runs_of(ray, first, last, rays, space, left, lengths_of, begins,
         t = (np.float32(k) + np.float32(0.5)) * step
         k += 1
         x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
-        voxel, clear = visit(x, y, z, *over, bricks, brick_count)
-        density = thin[voxel] if voxel >= 0 else np.float32(-1)
-        if density < 0:
-            if voxel >= 0:
-                clear = beyond(x, y, z, *over)
+        voxel, clear = _held_at(x, y, z, over, bricks, brick_count, held)
+        if voxel < 0:
             k += max(np.int64(min(clear / step, np.float32(last - k))), 0)
             continue
-        more = left * min(density * step, np.float32(1))
+        more = left * min(density[voxel] * step, np.float32(1))
         together = (
             length > 0
             and begins[count] + length == k - 1

@@ -84,6 +84,14 @@ def _until(x, inverse, cell, clear):
 
 
 @njit(**LEAN)
+def leave(x, y, z, u, v, w, over, clear):
+    """How far along a ray, one over its direction being `over`, a place leaves the cells that are
+    nearer than `clear` to its own, (u, v, w)."""
+    near = min(_until(x, over[0], u, clear), _until(y, over[1], v, clear))
+    return min(near, _until(z, over[2], w, clear))
+
+
+@njit(**LEAN)
 def inverse(d):
     """One over a direction; infinite, and above zero, where it does not move."""
     return np.float32(1) / d if d != 0 else np.float32(np.inf)
@@ -99,22 +107,11 @@ def visit(x, y, z, dx, dy, dz, bricks, brick_count):
     u, v, w = int(x), int(y), int(z)
     row = bricks[(u * brick_count + v) * brick_count + w]
     if row < 0:  # up to where the ray leaves the bricks that are clear as well
-        leave = min(_until(x, dx, u, -row), _until(y, dy, v, -row), _until(z, dz, w, -row))
-        return np.int64(-1), leave
+        return np.int64(-1), leave(x, y, z, u, v, w, (dx, dy, dz), -row)
     u = int((x - np.float32(u)) * BRICK)
     v = int((y - np.float32(v)) * BRICK)
     w = int((z - np.float32(w)) * BRICK)
     return np.int64(((row * BRICK + u) * BRICK + v) * BRICK + w), nothing
-
-
-@njit(**LEAN)
-def beyond(x, y, z, dx, dy, dz):
-    """How far along a direction, one over which is (dx, dy, dz), the voxel of a place in bricks
-    ends."""
-    fine, one = np.float32(BRICK), np.int64(1)
-    u, v, w = x * fine, y * fine, z * fine
-    leave = min(_until(u, dx, int(u), one), _until(v, dy, int(v), one), _until(w, dz, int(w), one))
-    return leave / fine
 
 
 @njit(**LEAN)

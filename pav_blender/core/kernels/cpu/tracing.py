@@ -15,7 +15,7 @@ import torch
 from numba import njit
 
 from ..reference.bricks import FOOT, MAP, SLACK
-from ..structures import Clearance, PosedMesh, Probing, Traced, Voxels
+from ..structures import Clearance, Known, PosedMesh, Probing, Traced, Voxels
 from .fields import (
     arrays_of,
     densities,
@@ -41,7 +41,7 @@ _NONE, _WANTED = -1, -2
 def trace(
     mesh: PosedMesh,
     voxels: Voxels,
-    known: torch.Tensor,
+    known: Known,
     field: tuple[Any, ...],
     origins: torch.Tensor,
     directions: torch.Tensor,
@@ -58,12 +58,11 @@ def trace(
 ) -> Traced:
     """Rays [R] to their ends, on this thread alone.
 
-    known [B, 4, 4, 4]: the density (1/m) that a guide knows of in each voxel, negative where
-    nothing can be; field: what `arrays_of` makes of a `Frozen`; first, last [R] int32: the lattice
-    indices to look at, places lying half a step further; band: metres from the mesh beyond which
-    nothing is; still [3, 4]: posed points to where the shoulders do not move; rotation [3, 3],
-    view [16, hidden]: the head's, and what harmonics of a direction in its axes add to the first
-    layer of the colour.
+    known: what a guide knows of the voxels; field: what `arrays_of` makes of a `Frozen`; first,
+    last [R] int32: the lattice indices to look at, places lying half a step further; band: metres
+    from the mesh beyond which nothing is; still [3, 4]: posed points to where the shoulders do not
+    move; rotation [3, 3], view [16, hidden]: the head's, and what harmonics of a direction in its
+    axes add to the first layer of the colour.
     """
     count = len(origins)
     traced = Traced(torch.zeros(count, 4), torch.zeros(count), torch.ones(count), 0)
@@ -340,7 +339,7 @@ def _trace(total, walked, space, frames, views, field, lengths_of, limits, outpu
     surface = arrays, triangle_maps, vertex_maps, vertices, mesh_corners, band
     rays = origins, directions, step
     grid = cells, size, grid_corner, grid_scale
-    voxels = space[0], space[1], space[5], space[3], space[4]
+    voxels = space[0], space[1], space[6], space[4], space[5]
     width, longest = lengths_of[0], lengths_of[2]
     tolerance, transmittance, negligible = limits
     out_colour, out_depth, out_left = outputs
