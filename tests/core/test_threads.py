@@ -25,6 +25,18 @@ def test_every_index_is_in_one_piece():
     assert seen == [1] * 1000
 
 
+def test_pieces_shrink_and_every_index_is_in_one():
+    pieces = []
+    run_chunks(lambda start, stop: pieces.append((start, stop)), 1000, 100, least=7)
+    pieces.sort()
+    assert [start for start, _ in pieces] == [0, *(stop for _, stop in pieces[:-1])]
+    assert pieces[-1][1] == 1000
+    sizes = [stop - start for start, stop in pieces]
+    assert sizes[:-1] == sorted(sizes[:-1], reverse=True)
+    assert sizes[0] == 100
+    assert min(sizes[:-1]) == 7
+
+
 def test_a_call_within_a_piece_stays_on_its_thread():
     alone = []
 

@@ -12,7 +12,6 @@ import numpy as np
 import torch
 
 from .. import kernels
-from ..cores import threads
 from ..deformation import Clearance, PosedMesh, Thrift, Voxels, voxels
 from ..deformation.rigid import Stance, stance
 from ..errors import Cancelled, InputError
@@ -28,7 +27,7 @@ from .rays import RayBatch, camera_rays, pack, samples_of, tiled
 from .sparing import passes
 from .wearing import Appearance, Wearing, deformer_of, short_tables_of, wearing_of
 
-_LEAST_CHUNK, _SHARES = 1 << 10, 8  # rays a thread takes at a time; times it should
+_LEAST_CHUNK = 1 << 9  # rays a thread takes at a time, at least
 _FAR_WAVE = 24  # samples a ray between two looks, where every look waits for a device
 _FINEST, _COARSEST = 1e-5, 0.1  # metres between places
 # float32 counts micrometres up to some metres: what is far off is brought near, by whole strides so
@@ -299,15 +298,10 @@ def render_scene(
         for wanted in passes(picture.rgba, picture.depth, limit, settings.agreement):
             wanted &= shown
             pixels = order[wanted.reshape(-1)[order]]
-            run_chunks(trace, len(pixels), _chunk(len(pixels), settings.chunk), pixels)
+            run_chunks(trace, len(pixels), settings.chunk, pixels, least=_LEAST_CHUNK)
         if progress is not None:
             progress(1.0)
     return replace(picture, evaluations=evaluations)
-
-
-def _chunk(count: int, most: int) -> int:
-    """How many rays a thread takes at a time, so that all of them have something to do."""
-    return min(most, max(_LEAST_CHUNK, -(-count // (_SHARES * threads()))))
 
 
 def trace_rays(

@@ -68,8 +68,23 @@ def _busy() -> Iterator[None]:
         _here.busy = False
 
 
-def run_chunks(fn: Callable[..., Any], n: int, chunk: int, *args: Any) -> None:
-    """Call `fn(start, stop, *args)` over [0, n) in pieces of `chunk`, on all threads at once.
+def _bounds(n: int, chunk: int, least: int | None) -> list[int]:
+    """Where pieces begin, and n: of `chunk` each; or of at most that, and the smaller the less is
+    left, down to `least`."""
+    if least is None:
+        return [*range(0, n, chunk), n]
+    found = [0]
+    while found[-1] < n:
+        share = -(-(n - found[-1]) // (2 * threads()))
+        found.append(min(n, found[-1] + min(chunk, max(least, share))))
+    return found
+
+
+def run_chunks(
+    fn: Callable[..., Any], n: int, chunk: int, *args: Any, least: int | None = None
+) -> None:
+    """Call `fn(start, stop, *args)` over [0, n) in pieces of `chunk`, on all threads at once; with
+    `least`, in pieces that shrink down to it, so that all threads end together.
 
     Pieces go to whichever thread is free, the caller's included, so uneven work balances itself;
     which thread runs which piece is not fixed, so pieces must not depend on one another. The first
@@ -79,17 +94,18 @@ def run_chunks(fn: Callable[..., Any], n: int, chunk: int, *args: Any) -> None:
     """
     if chunk < 1:
         raise ValueError(f"chunk must be at least 1, not {chunk}")
-    pieces = -(-n // chunk)
+    bounds = _bounds(n, chunk, least)
+    pieces = len(bounds) - 1
     workers = 1 if getattr(_here, "busy", False) else min(threads(), pieces)
     if workers <= 1:
-        for start in range(0, n, chunk):
-            fn(start, min(start + chunk, n), *args)
+        for piece in range(pieces):
+            fn(bounds[piece], bounds[piece + 1], *args)
         return
     code = getattr(fn, "__code__", fn)
     ahead = 0
     if code not in _ran:
         with _first, _busy():
-            fn(0, min(chunk, n), *args)
+            fn(0, bounds[1], *args)
         _ran.add(code)
         ahead = 1
     counter = itertools.count(ahead)
@@ -100,8 +116,7 @@ def run_chunks(fn: Callable[..., Any], n: int, chunk: int, *args: Any) -> None:
                 for piece in counter:
                     if piece >= pieces:
                         return
-                    start = piece * chunk
-                    fn(start, min(start + chunk, n), *args)
+                    fn(bounds[piece], bounds[piece + 1], *args)
         except BaseException:
             for _ in range(pieces):  # nothing is left for the others
                 if next(counter) >= pieces:
