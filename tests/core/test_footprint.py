@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 
 import numpy as np
@@ -145,6 +146,16 @@ def test_what_is_known_of_voxels(scene):
     torch.testing.assert_close(density, want, rtol=0, atol=0)
     bits = (held[:, None] >> torch.arange(64)) & 1
     assert torch.equal(bits.bool(), cells.view(-1, 64) >= 0)
+
+
+def test_where_nothing_is_filled_a_picture_is_empty(toy, toy_avatar):
+    clip, empty = toy.clip("plain"), copy.copy(toy_avatar)
+    empty.occupied = np.zeros_like(toy_avatar.occupied)
+    vertices = toy.posed(clip, np.array([7]))[0]
+    picture = rendering.render(empty, vertices, cameras(toy)["filmed"], "plain")
+    assert not picture.rgba.any()
+    assert np.isinf(picture.depth).all()
+    assert picture.evaluations == 0
 
 
 def test_cover_as_the_reference():

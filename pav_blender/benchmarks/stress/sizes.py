@@ -13,26 +13,27 @@ from .scene import Found, Given, Scene
 
 _SIDE = 8192
 _TILE = 128
+# pixels that are the mean of others are others where a picture begins elsewhere
+_EVERY = RenderSettings(agreement=0.0)
 
 
 def large_tiles(given: Given) -> Found:
     """8192 x 8192 pixels through a render border, here a tile of 128 x 128 over the face."""
     head, found = given.head, Found()
     camera = head.camera.resized(_SIDE, _SIDE)
-    # pixels that are the mean of others are others where a picture begins elsewhere
-    name, settings = head.avatar.appearances[0], RenderSettings(agreement=0.0)
+    name = head.avatar.appearances[0]
     middle = _SIDE // 2
     box = (middle, middle, middle + _TILE, middle + _TILE)
     started = time.perf_counter()
     whole = render(
-        head.avatar, head.vertices, camera, name, settings, expression=head.expression, region=box
+        head.avatar, head.vertices, camera, name, _EVERY, expression=head.expression, region=box
     )
     found.raw["seconds a tile"] = round(time.perf_counter() - started, 2)
     found.at_most("wrong numbers", wrong_values(whole, camera.window(*box)), 0)
     half = _TILE // 2
     corner = (middle + half, middle + half, middle + _TILE, middle + _TILE)
     part = render(
-        head.avatar, head.vertices, camera, name, settings,
+        head.avatar, head.vertices, camera, name, _EVERY,
         expression=head.expression, region=corner,
     )  # fmt: skip
     cut = replace(whole, rgba=whole.rgba[half:, half:], depth=whole.depth[half:, half:])
@@ -47,14 +48,16 @@ def large_whole(given: Given) -> Found:
         head.camera.resized(_SIDE, _SIDE),
         intrinsics=np.array([[110.0, 0, _SIDE / 2], [0, 110.0, _SIDE / 2], [0, 0, 1]]),
     )
-    picture = shown(head, camera=camera)
+    picture = shown(head, _EVERY, camera)
     found.at_most("wrong numbers", sum(
         wrong_values(replace(picture, rgba=picture.rgba[y:y + 512], depth=picture.depth[y:y + 512]),
                      camera.window(0, y, _SIDE, y + 512))
         for y in range(0, _SIDE, 512)), 0)  # fmt: skip
     a, b = _SIDE // 2 - 24, _SIDE // 2 + 24
     middle = replace(picture, rgba=picture.rgba[a:b, a:b], depth=picture.depth[a:b, a:b])
-    found.at_most("from a picture of the head alone", apart(middle, shown(head)), 1.0, "/255")
+    found.at_most(
+        "from a picture of the head alone", apart(middle, shown(head, _EVERY)), 1.0, "/255"
+    )
     return found
 
 

@@ -27,9 +27,9 @@ def known_density(voxels: Voxels, guide: torch.Tensor) -> Known:
         _look_up,
         count,
         1 << 10,
-        rows_of(voxels.cells.view(count, -1), np.int32),
+        rows_of(voxels.cells.view(count, _VOXELS), np.int32),
         flat(guide),
-        known.density.view(count, -1).numpy(),
+        known.density.view(count, _VOXELS).numpy(),
         known.held.numpy(),
     )
     return known
