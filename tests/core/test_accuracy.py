@@ -115,7 +115,10 @@ def test_pieces_keep_to_their_bounds_and_a_wrong_one_does_not(toy_avatar, frame,
     monkeypatch.setattr(rounding, "_SEARCHED", 40)
     rows, claims = rounding.measure(toy_avatar, frame)
     assert all(claim.met for claim in claims), [c for c in claims if not c.met]
-    assert len(rows) == len(claims) == 10
+    assert len(rows) == len(claims) == 11
+    monkeypatch.setattr(rounding, "exp_all", lambda values, count: None)
+    broken = rounding.functions()[1]
+    assert broken["largest error"] > broken["bound"]
     monkeypatch.setattr(rounding, "spherical_harmonics", lambda x: torch.zeros(len(x), 16))
     assert rounding.harmonics()["largest error"] > 0.2
 
