@@ -22,8 +22,9 @@ from ..core.evaluation.heldout import chosen_frames
 from ..core.evaluation.metrics import over, psnr
 from ..core.evaluation.report import Claim
 from ..core.field.avatar import Avatar
+from ..core.kernels.cpu.threads import torch_alone
 from ..core.progress import Report
-from ..core.rendering.render import Picture, RenderSettings, render
+from ..core.rendering.render import Picture, RenderSettings, pose_scene, render, render_scene
 from ..core.training.frames import Frame
 from ..studio import DEFAULT_COLLECTION
 from .measure import Options, a_frame, best, plot, show, subject
@@ -34,6 +35,12 @@ _PLAIN_PIXELS = 6  # every sample is held against every triangle: minutes
 _DETAILED = 256  # pixels a side at which every setting is tried
 _FINAL = RenderSettings.preset("final")
 _PREVIEW = RenderSettings.preset("preview")
+# for fewer places than "preview" looks at
+COARSE = {
+    "preview": _PREVIEW,
+    "preview, step 3.5 mm": dataclasses.replace(_PREVIEW, step=3.5e-3),
+    "preview, agreement 0.3": dataclasses.replace(_PREVIEW, agreement=0.3),
+}
 # switch, what is changed to turn it off
 SKIPS = {
     "voxels and their guide": {"skip": False},
@@ -57,8 +64,10 @@ def run(options: Options, progress: Report | None = None) -> tuple[dict[str, Any
         if size == _DETAILED:
             skips = _skips(avatar, frame, size, truth, options.repeats)
             points += _altered(avatar, frame, size, truth, options.repeats)
+    parts = _parts(avatar, frame, options.repeats)
     looks = _looks(avatar, collection)
     show(points)
+    show(parts)
     show(skips)
     show(looks)
     agreement = _against_plain(avatar, frame, exact[frame.camera.width])
@@ -81,6 +90,7 @@ def run(options: Options, progress: Report | None = None) -> tuple[dict[str, Any
     fields = {
         "points": points,
         "skips": skips,
+        "parts": parts,
         "looks": looks,
         "plain_torch_psnr": round(agreement, 2),
         "cold_start_seconds": cold,
@@ -113,6 +123,7 @@ def _variants(size: int) -> dict[str, RenderSettings]:
         found[f"step {step:g} mm"] = change(_FINAL, step=step * 1e-3)
     if size != _DETAILED:
         return found
+    found |= COARSE
     for left in (1e-4, 1e-3, 2e-2):
         found[f"transmittance {left:g}"] = change(_FINAL, transmittance=left)
     for share in (0.0, 0.05, 0.1):
@@ -185,9 +196,23 @@ def _skips(
     return _timed(avatar, frame, size, truth, variants, repeats)
 
 
+def _parts(avatar: Avatar, frame: Frame, repeats: int) -> list[dict[str, Any]]:
+    """Seconds of a picture's two parts: the pose, and the rays of one that is posed."""
+    name, rows = avatar.appearances[frame.appearance], []
+    pose = partial(pose_scene, avatar, frame.vertices, name, frame.expression)
+    scene = pose()
+    for preset, size in (("preview", 256), ("final", 512)):
+        camera = frame.camera.resized(size, size)
+        rays = partial(render_scene, scene, camera, RenderSettings.preset(preset))
+        with torch.inference_mode(), torch_alone():
+            seconds = best({"pose": pose, "rays": rays}, repeats)
+        rows.append({"name": preset, "size": size} | {k: round(v, 4) for k, v in seconds.items()})
+    return rows
+
+
 def _looks(avatar: Avatar, collection: Collection) -> list[dict[str, Any]]:
-    """The final preset for every appearance in a held-out pose of its own, and in one of another's,
-    which no frame has shown it in."""
+    """Every appearance in a held-out pose of its own, by the presets and by coarser ones than
+    "preview", and by "final" in one of another's, which no frame has shown it in."""
     frames = chosen_frames(collection, ("test",), None)
     rows = []
     for row, name in enumerate(avatar.appearances):
@@ -196,10 +221,12 @@ def _looks(avatar: Avatar, collection: Collection) -> list[dict[str, Any]]:
         for motion, frame in (("own", own[len(own) // 2]), ("another's", others[1])):
             worn = dataclasses.replace(frame, appearance=row)
             truth = _picture(avatar, worn, _DETAILED, RenderSettings.preset("reference"))
-            point = _point(avatar, worn, _DETAILED, _FINAL, truth, name)
-            rows.append({"appearance": name, "motion": motion} | point)
-    for point in rows:
-        del point["seconds"], point["name"]
+            for label, settings in (
+                {"final": _FINAL} | (COARSE if motion == "own" else {})
+            ).items():
+                point = _point(avatar, worn, _DETAILED, settings, truth, label)
+                del point["seconds"]
+                rows.append({"appearance": name, "motion": motion} | point)
     return rows
 
 

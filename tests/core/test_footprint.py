@@ -21,6 +21,7 @@ from pav_blender.core.rendering.render import RenderSettings, render_scene
 from pav_blender.core.training.frames import camera_of
 
 STEP = 1e-3
+NAMES = ["filmed", "a part", "nearer, skewed", "of a rounded rotation", "parallel"]
 
 
 @pytest.fixture(scope="module")
@@ -34,12 +35,15 @@ def cameras(toy):
     filmed = camera_of(toy.clip("plain"), 7).resized(72, 72)
     near = filmed.camera_to_world.copy()
     near[:3, 3] -= 0.2 * near[:3, 2]
+    rounded = filmed.camera_to_world.copy()
+    rounded[:3, :3] @= np.array([[1.03, 0.03, 0.0], [0.0, 1.03, 0.0], [0.0, 0.0, 0.97]])
     scale = np.array([[120.0, 0, 36], [0, 120, 36], [0, 0, 1]])
     skewed = filmed.intrinsics + np.array([[0, 15.0, 0], [0, 0, 0], [0, 0, 0]])
     return {
         "filmed": filmed,
         "a part": filmed.window(20, 10, 61, 37),
         "nearer, skewed": replace(filmed, camera_to_world=near, intrinsics=skewed),
+        "of a rounded rotation": replace(filmed, camera_to_world=rounded),
         "parallel": Camera(72, 72, scale, filmed.camera_to_world, parallel=True),
     }
 
@@ -49,7 +53,7 @@ def all_rays(camera):
     return rows, columns, camera_rays(camera, columns, rows)
 
 
-@pytest.mark.parametrize("name", ["filmed", "a part", "nearer, skewed", "parallel"])
+@pytest.mark.parametrize("name", NAMES)
 def test_all_places_in_bricks_lie_within_the_footprint(name, toy, scene):
     camera = cameras(toy)[name]
     where = footprint(scene.voxels, camera)

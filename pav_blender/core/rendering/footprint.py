@@ -43,8 +43,9 @@ def footprint(voxels: Voxels, camera: Camera, start: float = 0.0) -> Footprint:
     shape = -(-camera.height // tile), -(-camera.width // tile)
     held = np.argwhere(voxels.bricks.numpy() >= 0)
     middles = voxels.box_min.numpy() + (held + 0.5) / voxels.scale
-    radius = np.sqrt(3) / 2 / voxels.scale
-    local = (middles - camera.origin) @ camera.camera_to_world[:3, :3]
+    back = np.linalg.inv(camera.camera_to_world[:3, :3])  # a rotation from a file is a rounded one
+    radius = np.sqrt(3) / 2 / voxels.scale * np.linalg.norm(back, 2)
+    local = (middles - camera.origin) @ back.T
     if camera.parallel:
         along, spread = local[:, 2], np.full((len(local), 2), radius)
     else:

@@ -48,7 +48,7 @@ class RenderSettings:
     negligible: weight a metre below which a sample's colour is not asked for; agreement: a pixel
     between four that differ by less is their mean (`sparing`; 0: every pixel is traced); brief:
     tables and networks in bfloat16 where the processor multiplies it; wave: samples a ray between
-    two looks at its transmittance; chunk: rays that a thread takes at a time.
+    two looks at its transmittance; chunk: rays that a thread takes at a time, at most.
     """
 
     step: float = 1e-3

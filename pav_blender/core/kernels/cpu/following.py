@@ -11,7 +11,7 @@ from numba import njit
 from ..reference.bricks import BRICK
 from ..structures import Known, Voxels
 from .marching import flat, rows_of
-from .picking import inverse, leave
+from .picking import in_bricks, leave
 from .search import LEAN, OPTIONS
 from .threads import run_chunks
 
@@ -119,15 +119,7 @@ def _enter(start, stop, rays, nears, fars, space, out_first, out_last):
         if near <= far < np.inf:
             first = np.int64(np.ceil(max(near / step - half, nothing)))
             last = np.int64(np.floor(far / step - half))
-        ox = (origins[ray, 0] - corner[0]) * scale
-        oy = (origins[ray, 1] - corner[1]) * scale
-        oz = (origins[ray, 2] - corner[2]) * scale
-        dx, dy, dz = (
-            directions[ray, 0] * scale,
-            directions[ray, 1] * scale,
-            directions[ray, 2] * scale,
-        )
-        over = inverse(dx), inverse(dy), inverse(dz)
+        (ox, oy, oz), (dx, dy, dz), over = in_bricks(ray, origins, directions, corner, scale)
         while first <= last:
             t = (np.float32(first) + half) * step
             x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
@@ -139,6 +131,8 @@ def _enter(start, stop, rays, nears, fars, space, out_first, out_last):
 
 
 def space_of(voxels: Voxels, known: Known) -> tuple[Any, ...]:
+    """What compiled functions are told of voxels: bricks, how many a side, densities, bits, lowest
+    corner, bricks a metre, maps."""
     return (
         rows_of(voxels.bricks.view(-1), np.int32),
         len(voxels.bricks),
@@ -161,11 +155,7 @@ def runs_of(ray, first, last, rays, space, left, lengths_of, begins,
     origins, directions, step = rays
     bricks, brick_count, density, held, corner, scale, _ = space
     width, share, longest, probe = lengths_of
-    ox = (origins[ray, 0] - corner[0]) * scale
-    oy = (origins[ray, 1] - corner[1]) * scale
-    oz = (origins[ray, 2] - corner[2]) * scale
-    dx, dy, dz = directions[ray, 0] * scale, directions[ray, 1] * scale, directions[ray, 2] * scale
-    over = inverse(dx), inverse(dy), inverse(dz)
+    (ox, oy, oz), (dx, dy, dz), over = in_bricks(ray, origins, directions, corner, scale)
     count, length, added = -1, 0, np.float32(0.0)
     k = first
     while k <= last:

@@ -53,10 +53,10 @@ def _linear_parts(start, stop, canonical, posed, corners, out):
         a, b, c = corners[triangle, 0], corners[triangle, 1], corners[triangle, 2]
         ux, uy, uz, vx, vy, vz, nx, ny, nz, area = _frame(posed, a, b, c)
         kx, ky, kz, lx, ly, lz, mx, my, mz, there = _frame(canonical, a, b, c)
-        out[triangle, 9] = area if there > 0 else 0.0
         if not (area > 0 and there > 0):
             out[triangle] = 0.0
             continue
+        out[triangle, 9] = area
         # of [u v n] with n of unit length the inverse's rows are v x n, n x u, both over |u x v|, n
         nx, ny, nz = nx / area, ny / area, nz / area
         mx, my, mz = mx / there, my / there, mz / there

@@ -92,22 +92,34 @@ def leave(x, y, z, u, v, w, over, clear):
 
 
 @njit(**LEAN)
-def inverse(d):
+def _inverse(d):
     """One over a direction; infinite, and above zero, where it does not move."""
     return np.float32(1) / d if d != 0 else np.float32(np.inf)
 
 
 @njit(**LEAN)
-def visit(x, y, z, dx, dy, dz, bricks, brick_count):
+def in_bricks(ray, origins, directions, corner, scale):
+    """A ray in bricks: where it begins, its direction, and one over that."""
+    dx, dy, dz = directions[ray, 0] * scale, directions[ray, 1] * scale, directions[ray, 2] * scale
+    begin = (
+        (origins[ray, 0] - corner[0]) * scale,
+        (origins[ray, 1] - corner[1]) * scale,
+        (origins[ray, 2] - corner[2]) * scale,
+    )
+    return begin, (dx, dy, dz), (_inverse(dx), _inverse(dy), _inverse(dz))
+
+
+@njit(**LEAN)
+def _visit(x, y, z, over, bricks, brick_count):
     """The flat voxel of a place (x, y, z), in bricks, or -1 where there is none; and how far along
-    a direction, one over which is (dx, dy, dz), there will be none either."""
+    a direction, one over which is `over`, there will be none either."""
     nothing = np.float32(0)
     if not (min(x, y, z) >= 0 and max(x, y, z) < np.float32(brick_count)):
         return np.int64(-1), nothing
     u, v, w = int(x), int(y), int(z)
     row = bricks[(u * brick_count + v) * brick_count + w]
     if row < 0:  # up to where the ray leaves the bricks that are clear as well
-        return np.int64(-1), leave(x, y, z, u, v, w, (dx, dy, dz), -row)
+        return np.int64(-1), leave(x, y, z, u, v, w, over, -row)
     u = int((x - np.float32(u)) * BRICK)
     v = int((y - np.float32(v)) * BRICK)
     w = int((z - np.float32(w)) * BRICK)
@@ -119,18 +131,14 @@ def _choose(ray, first, last, origins, directions, jitter, step, bricks, brick_c
             scale, guide, chance, left, share, longest, opaque, width, k_out,
             steps_out):  # fmt: skip
     """The places of one ray that are samples: how many, how many looks, where to go on."""
-    ox = (origins[ray, 0] - corner[0]) * scale
-    oy = (origins[ray, 1] - corner[1]) * scale
-    oz = (origins[ray, 2] - corner[2]) * scale
-    dx, dy, dz = directions[ray, 0] * scale, directions[ray, 1] * scale, directions[ray, 2] * scale
-    over = inverse(dx), inverse(dy), inverse(dz)
+    (ox, oy, oz), (dx, dy, dz), over = in_bricks(ray, origins, directions, corner, scale)
     count, looks, length, begin = 0, 0, 0, 0
     added, passed = np.float32(0.0), np.float32(0.0)
     k = first
     while k <= last:
         t = (np.float32(k) + jitter) * step
         k += 1
-        voxel, clear = visit(ox + t * dx, oy + t * dy, oz + t * dz, *over, bricks, brick_count)
+        voxel, clear = _visit(ox + t * dx, oy + t * dy, oz + t * dz, over, bricks, brick_count)
         cell = cells[voxel] if voxel >= 0 else -1
         if cell < 0:
             k += max(np.int64(min(clear / step, np.float32(last - k))), 0)
