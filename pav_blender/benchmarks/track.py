@@ -87,7 +87,7 @@ def _person(folder: Path, seed: int, progress: Report | None) -> Collection:
         render_collection(
             path, appearances=_LOOKS, frames=_FRAMES, size=max(SIZES), seed=seed, views=(),
             truth="light", samples=_SAMPLES,
-            progress=lambda fraction, what: tell(fraction, step=f"filming person {seed}: {what}"),
+            progress=lambda fraction, step: tell(fraction, step=f"person {seed}: {step}"),
         )  # fmt: skip
     return read_collection(path)
 

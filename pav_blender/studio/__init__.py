@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import json
-import sys
-import time
 from pathlib import Path
 
 from ..core.errors import InputError
+from ..core.progress import Progress
 
 __all__ = ["DEFAULT_COLLECTION", "add_arguments", "render_collection", "run"]
 
@@ -51,25 +49,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """`pav studio`: renders the collection, progress on stderr; returns the exit code."""
-    lines = bool(getattr(args, "json_progress", False))
-    started = time.monotonic()
-
-    def progress(fraction: float, what: str) -> None:
-        seconds = time.monotonic() - started
-        if lines:
-            record = {"step": what, "fraction": round(fraction, 4), "seconds": round(seconds, 1)}
-            print(json.dumps(record), file=sys.stderr, flush=True)
-        elif sys.stderr.isatty():
-            filled = int(30 * fraction)
-            bar = "#" * filled + "." * (30 - filled)
-            end = "\n" if fraction >= 1 else ""
-            left = seconds / fraction * (1 - fraction)
-            print(f"\r[{bar}] {what:<16} {left:5.0f} s left", end=end, file=sys.stderr, flush=True)
-
     render_collection(
         args.out, appearances=args.appearances, frames=args.frames, size=args.size,
         seed=args.seed, performance=args.performance, truth=args.truth, overwrite=args.overwrite,
-        progress=progress, first=args.first,
+        progress=Progress("studio", as_json=args.json_progress), first=args.first,
     )  # fmt: skip
     print(args.out)
     return 0

@@ -15,6 +15,7 @@ from ..core.collection import Clip, CollectionWriter
 from ..core.errors import InputError
 from ..core.files import write_text
 from ..core.head import builtin_head
+from ..core.progress import Report
 from .appearances import APPEARANCES, Appearance, build_scene
 from .camera import intrinsics_of, look_at
 from .identity import identity
@@ -25,7 +26,6 @@ from .scene import LABEL, StudioScene
 
 VIEWS = (-42.0, -28.0, 28.0, 42.0)  # degrees of orbit of the held-out cameras
 FRAME_HEIGHT = 0.41  # metres that the picture spans at the head's distance
-Progress = Callable[[float, str], None]
 
 
 @dataclass(eq=False)
@@ -51,7 +51,7 @@ class Picture:
 
 def render_collection(
     out: Path, *, appearances: int = 3, frames: int = 60, size: int = 256, seed: int = 0,
-    performance: int = 0, views=VIEWS, truth: str = "full", progress: Progress | None = None,
+    performance: int = 0, views=VIEWS, truth: str = "full", progress: Report | None = None,
     overwrite: bool = False, samples: int | None = None, first: int = 1,
 ) -> Path:  # fmt: skip
     """Render `appearances` clips of `frames` pictures of `size` x `size` and write a collection.
@@ -60,7 +60,7 @@ def render_collection(
     `views` are orbit angles in degrees of held-out cameras, one extra picture a clip each. `truth`
     "full" adds the posed vertices and depth to the parameters, labels and mattes. `performance`
     numbers what the person does, before which camera: the same person in the same looks is filmed
-    doing other things. `progress` gets (fraction done, what). The result depends on the arguments
+    doing other things. progress(fraction, step=what). The result depends on the arguments
     only. Raises InputError.
     """
     _check(appearances, frames, size, performance, truth, first)
@@ -87,7 +87,7 @@ def render_collection(
                         vertices.append(picture.vertices)
                     done += 1
                     if progress:
-                        progress(done / total, f"{look.name} {shot.frame_id}")
+                        progress(done / total, step=f"filming {look.name} {shot.frame_id}")
             writer.clip(_clip(look, shots, size, vertices))
         note = _note(appearances, frames, size, (seed, performance), truth, len(views), first)
         write_text(writer.root / "README.md", note)

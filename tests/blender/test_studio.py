@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from pav_blender.core.collection import LABELS, read_collection
 from pav_blender.core.errors import InputError
 from pav_blender.core.head import builtin_head
 from pav_blender.core.images import read_gray, read_rgba
+from pav_blender.core.progress import Progress
 from pav_blender.core.rendering.cameras import Camera
 from pav_blender.core.rendering.rasterise import rasterise
 
@@ -33,8 +35,12 @@ def person():
 @pytest.fixture(scope="module")
 def small(tmp_path_factory):
     """Three frames and one held-out view of the first appearance, with full truth."""
-    path = tmp_path_factory.mktemp("studio") / "small"
-    render_collection(path, appearances=1, frames=3, size=96, seed=4, views=(35.0,), samples=4)
+    path, told = tmp_path_factory.mktemp("studio") / "small", io.StringIO()
+    render_collection(
+        path, appearances=1, frames=3, size=96, seed=4, views=(35.0,), samples=4,
+        progress=Progress("film", stream=told),
+    )  # fmt: skip
+    assert "film 100.0 %  step filming" in told.getvalue()
     return read_collection(path)
 
 
