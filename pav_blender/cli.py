@@ -27,7 +27,7 @@ VERBS = {
     "export": "a collection in INSTA's or VHAP's layout, or as posed meshes",
     "head": "a head file out of any Blender mesh with shape keys",
     "scene": "build a Blender scene of an avatar on a track",
-    "table": "reproduce a table of the paper: ablation, comparison, efficiency",
+    "table": "reproduce a table of the paper, or of what sets ours apart from it",
     "eval": "measure an avatar on frames it has not seen, with the field's metrics",
     "bench": "measure speed against error: render, accuracy, train, kernels, scale, matte, track",
     "stress": "hostile scenes: what must hold in each, and what was seen",

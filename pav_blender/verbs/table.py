@@ -11,10 +11,12 @@ from ..core.errors import InputError
 from ..core.progress import Progress
 from ..core.stopping import StopSignal
 
-SUMMARY = "Reproduce a table of the paper: trains its methods, measures them, writes the table."
+SUMMARY = (
+    "Reproduce a table of the paper, or of our own choices: trains, measures, writes the table."
+)
 EXAMPLE = "pav table ablation --out out/table --check"
 
-NAMES = ("ablation", "comparison", "efficiency")
+NAMES = ("ablation", "choices", "comparison", "efficiency")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

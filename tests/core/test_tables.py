@@ -13,7 +13,7 @@ from pav_blender.cli import main
 from pav_blender.core.collection import read_collection
 from pav_blender.core.config import Config
 from pav_blender.core.errors import Cancelled, InputError
-from pav_blender.core.evaluation.methods import METHODS, method
+from pav_blender.core.evaluation.methods import CHOICES, METHODS, method
 from pav_blender.core.evaluation.paper_tables import TABLES
 from pav_blender.core.evaluation.study import Result, Study, result
 from pav_blender.core.evaluation.tables import Cell, Column, Table, latex, markdown
@@ -93,6 +93,21 @@ def test_one_network_is_compared_with_one_a_clip():
         run.seconds, run.bytes = 290.0, 10**8
     _, claims = TABLES["efficiency"].build(found, "caption")
     assert [claim.met for claim in claims] == [False, True, True]
+
+
+def test_each_choice_of_ours_is_taken_back_alone():
+    ours = Config().to_json()
+    for choice in CHOICES:
+        changed = {k for k, v in choice.config.to_json().items() if v != ours[k]}
+        several = choice.key in ("exact_turns", "from_fog", "paper_rates")
+        assert len(changed) > 1 if several else len(changed) == 1
+    found = _results(**{**{choice.key: 25 for choice in CHOICES}, "ours": 26, "rigid": 26.5})
+    tables, claims = TABLES["choices"].build(found, "caption")
+    assert [table.name for table in tables] == ["choices_test", "choices_novel"]
+    assert len(tables[0].rows) == len(CHOICES) + 1
+    assert [claim.name for claim in claims if not claim.met] == [
+        "ours above ours, a rigid frame a triangle"
+    ]
 
 
 def test_a_method_of_each_row_and_no_other():

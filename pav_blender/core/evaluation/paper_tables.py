@@ -1,4 +1,5 @@
-"""The paper's three tables out of results: which rows, which columns, what must come out."""
+"""The paper's three tables out of results, and one of our own choices: which rows, which columns,
+what must come out."""
 
 from __future__ import annotations
 
@@ -7,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from .evaluate import METRICS
-from .methods import METHODS
+from .methods import CHOICES, METHODS
 from .report import Claim
 from .study import Result
 from .tables import Cell, Column, Table
@@ -32,6 +33,7 @@ _SETS = {
 }
 _ABLATION = ("insta", "no_lnf", "no_offset", "surface", "full", "ours")
 _UNIFIED = ("insta", "full", "ours", "ours_two")
+_CHOICES = ("ours", *(m.key for m in CHOICES))
 _SEPARATE = ("insta_clips", "full", "ours")
 
 
@@ -91,6 +93,19 @@ def _ablation(results: Results, caption: str) -> tuple[list[Table], list[Claim]]
     return tables, claims
 
 
+def _choices(results: Results, caption: str) -> tuple[list[Table], list[Claim]]:
+    """What each choice of ours gives, on poses that no training saw."""
+    sets = [of for of in ("test", "novel") if of in results["ours"][0].measures]
+    tables = [
+        quality(f"choices_{of}", f"{caption}: {_SETS[of]}", results, _CHOICES, of) for of in sets
+    ]
+    claims = [
+        Claim.at_least(f"ours above {_TITLES[key]}", _above(results, "ours", key), 0.0, "dB")
+        for key in _CHOICES[1:]
+    ]
+    return tables, claims
+
+
 def _comparison(results: Results, caption: str) -> tuple[list[Table], list[Claim]]:
     table = quality("comparison", caption, results, _UNIFIED, "test")
     table.sections[0] = "(a) one network for all clips, held-out frames"
@@ -146,5 +161,6 @@ def _efficiency(results: Results, caption: str) -> tuple[list[Table], list[Claim
 TABLES = {
     "ablation": PaperTable("Ablation", _ABLATION, _ablation),
     "comparison": PaperTable("Comparison", ("insta", "insta_clips", "full", "ours"), _comparison),
+    "choices": PaperTable("Choices", _CHOICES, _choices),
     "efficiency": PaperTable("Efficiency", _SEPARATE, _efficiency),
 }
