@@ -67,11 +67,6 @@ class Config:
     # the paper's sees the expression too; some fifty values tell the filmed frames apart, and what
     # is learned by that does not hold for others
     sees_expression: bool = False
-    # what training adds to the view direction a ray, and to the turn a frame and batch (standard
-    # deviations): a few dozen frames leave gaps between their turns, and what is learned exactly
-    # at each does not hold between them
-    direction_noise: float = 0.15
-    turn_noise: float = 0.05
     # the paper's offset sees the embedding and the expression; seeing the point's geometry
     # features too lets one appearance fill space that another leaves empty
     offset_sees_geometry: bool = True
@@ -145,8 +140,6 @@ class Config:
             density_bias=-4.5,
             offset_sees_geometry=False,
             sees_turn=False,
-            direction_noise=0.0,
-            turn_noise=0.0,
             sees_expression=True,
             distortion_weight=0.0,
             learning_rate=2.5e-3,

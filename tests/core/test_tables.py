@@ -99,7 +99,7 @@ def test_each_choice_of_ours_is_taken_back_alone():
     ours = Config().to_json()
     for choice in CHOICES:
         changed = {k for k, v in choice.config.to_json().items() if v != ours[k]}
-        several = choice.key in ("exact_turns", "from_fog", "paper_rates")
+        several = choice.key in ("from_fog", "paper_rates")
         assert len(changed) > 1 if several else len(changed) == 1
     found = _results(**{**{choice.key: 25 for choice in CHOICES}, "ours": 26, "rigid": 26.5})
     tables, claims = TABLES["choices"].build(found, "caption")

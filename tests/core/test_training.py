@@ -163,9 +163,8 @@ def test_training_sees_a_frame_as_rendering_does(toy, frames, small_config):
     trainer = Trainer(avatar, frames)
     frame = frames[3]
     pixels = draw_pixels([frame], 512, np.random.default_rng(0))
-    exact = dataclasses.replace(small_config, direction_noise=0.0, turn_noise=0.0)
     picked = pick_samples(
-        trainer._poses, pixels, trainer.visibility, exact, 2e-3, trainer.generator
+        trainer._poses, pixels, trainer.visibility, small_config, 2e-3, trainer.generator
     )
     name = avatar.appearances[frame.appearance]
     scene = pose_scene(avatar, frame.vertices, name, frame.expression)
@@ -178,19 +177,6 @@ def test_training_sees_a_frame_as_rendering_does(toy, frames, small_config):
     assert (still - picked.samples.canonical).abs().max() > 0.01  # they differ in the head
     seen = pixels.rays.directions @ torch.from_numpy(scene.stance.rotation)
     torch.testing.assert_close(picked.samples.direction, seen)
-    noisy = dataclasses.replace(exact, direction_noise=0.1, turn_noise=0.05)
-    shaken, turns = [], []
-    for _ in range(64):
-        batch = pick_samples(
-            trainer._poses, pixels, trainer.visibility, noisy, 2e-3, trainer.generator
-        )
-        shaken.append(batch.samples.direction)
-        turns.append(batch.samples.condition[0, -3:] - scene.condition[-3:])
-    assert 0.04 < float(torch.stack(turns).std()) < 0.06
-    across = torch.stack(shaken) - seen
-    across = across - (across * seen).sum(-1, keepdim=True) * seen
-    assert 0.09 < float((across.square().sum(-1) / 2).mean().sqrt()) < 0.11
-    torch.testing.assert_close(torch.stack(shaken).norm(dim=-1), torch.ones(64, len(seen)))
     assert torch.equal(picked.samples.appearance.unique(), torch.tensor([frame.appearance]).int())
 
 

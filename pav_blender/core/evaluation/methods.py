@@ -36,11 +36,6 @@ _SURFACE = dataclasses.replace(_PAPER, appearance="surface")
 _ALIKE = ("learning_rate", "offset_learning_rate", "table_learning_rate", "latent_learning_rate")
 _RATES = {name: getattr(_PAPER, name) for name in (*_ALIKE, "final_learning_rate")}
 _CHANGES: tuple[tuple[str, str, dict[str, Any]], ...] = (
-    (
-        "exact_turns",
-        "no noise on directions and turns",
-        {"direction_noise": 0.0, "turn_noise": 0.0},
-    ),
     ("no_turn", "density does not see the turn", {"sees_turn": False}),
     ("no_shoulders", "no features that rest with the shoulders", {"shoulder_levels": 0}),
     ("expression", "density sees the expression", {"sees_expression": True}),

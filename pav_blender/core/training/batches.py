@@ -166,9 +166,8 @@ def pick_samples(
     generator: torch.Generator,
     codes: torch.Tensor | None = None,
 ) -> Picked:
-    """The samples of all rays, by what the field was of late; no network runs. View directions and
-    turns are shaken as the settings say. codes [A, P]: of several people, whose head each
-    appearance is (`identities.codes`)."""
+    """The samples of all rays, by what the field was of late; no network runs. codes [A, P]: of
+    several people, whose head each appearance is (`identities.codes`)."""
     ops = kernels.select("cpu")
     count = len(pixels.rays)
     stops = [*pixels.starts[1:], count]
@@ -204,11 +203,8 @@ def pick_samples(
         parts.append(Seen(picks, appearance, jitter[a:b], *rays, stance.shoulders, stance.offset))
         expression = pixels.frames[index].expression
         person = None if codes is None else codes[appearance]
-        turn = _shaken(torch.from_numpy(stance.turn), config.turn_noise, generator).numpy()
-        conditions.append(condition(config, expression, turn, person))
-        seen_from = rays[1] @ torch.from_numpy(stance.rotation)
-        seen_from = _shaken(seen_from, config.direction_noise, generator)
-        directions.append(torch.nn.functional.normalize(seen_from, dim=1))
+        conditions.append(condition(config, expression, stance.turn, person))
+        directions.append(rays[1] @ torch.from_numpy(stance.rotation))
     found = ops.batches.gather(parts, step, visibility.spaces[0])
     samples = Samples(
         canonical=found.canonical,
@@ -223,7 +219,3 @@ def pick_samples(
         direction=torch.cat(directions),
     )
     return Picked(samples, found.t, found.width, found.cells, looks, torch.cat(ended))
-
-
-def _shaken(values: torch.Tensor, noise: float, generator: torch.Generator) -> torch.Tensor:
-    return values + noise * torch.randn(values.shape, generator=generator) if noise else values
