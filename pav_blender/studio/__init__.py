@@ -44,6 +44,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--truth", choices=("full", "light"), default="full",
                         help="full: also depth and posed vertices")  # fmt: skip
+    parser.add_argument(
+        "--samples", type=int, metavar="N", help="of a pixel, for less noise (16; large: 24)"
+    )
     parser.add_argument("--overwrite", action="store_true", help="replace a collection there")
 
 
@@ -53,6 +56,7 @@ def run(args: argparse.Namespace) -> int:
         args.out, appearances=args.appearances, frames=args.frames, size=args.size,
         seed=args.seed, performance=args.performance, truth=args.truth, overwrite=args.overwrite,
         progress=Progress("studio", as_json=args.json_progress), first=args.first,
+        samples=args.samples,
     )  # fmt: skip
     print(args.out)
     return 0

@@ -17,6 +17,7 @@ from .nodes import new_material
 
 COLOUR_SAMPLES = 16
 MATTE_SAMPLES = 32
+NOISE = 0.05  # at which a pixel gets no more samples
 
 
 def configure(scene, size: int) -> None:
@@ -62,10 +63,10 @@ def _cycles():
 class Passes:
     """Renders a studio scene to arrays; holds the override material and a scratch folder."""
 
-    def __init__(self, scene, size: int, samples: int | None = None):
-        self.scene = scene
+    def __init__(self, scene, size: int):
+        self.scene, self.size = scene, size
         configure(scene, size)
-        self.samples = samples or (COLOUR_SAMPLES if size <= 320 else 24)
+        self.expose(None)
         # Debian's Blender has no denoiser: more samples take its place
         self.denoise = bool(getattr(_cycles(), "with_openimagedenoise", False))
         if self.denoise:
@@ -77,6 +78,15 @@ class Passes:
         )
         self.scratch = tempfile.TemporaryDirectory(prefix="pav_studio_")
 
+    def expose(self, samples: int | None) -> None:
+        """How many samples a pixel gets at most (None: 16, above 320 pixels 24). Where they are
+        more than that, mattes get as many times more too."""
+        usual = COLOUR_SAMPLES if self.size <= 320 else 24
+        self.samples = samples or usual
+        more = max(1.0, self.samples / usual)
+        self.matte_samples = round(MATTE_SAMPLES * more)
+        self.noise = NOISE / more**0.5
+
     def close(self) -> None:
         bpy.data.materials.remove(self.flat)
         self.scratch.cleanup()
@@ -87,13 +97,13 @@ class Passes:
         cycles.samples = self.samples if self.denoise else 8 * self.samples
         cycles.use_denoising = self.denoise
         cycles.use_adaptive_sampling = True
-        cycles.adaptive_threshold = 0.05 if self.denoise else 0.015
+        cycles.adaptive_threshold = self.noise if self.denoise else 0.3 * self.noise
         cycles.filter_width = 1.5
         return self._render()["Combined"]
 
     def matte(self) -> np.ndarray:
         """Coverage [H,W] from many samples of plain emission."""
-        with self._flattened(MATTE_SAMPLES, 1.5):
+        with self._flattened(self.matte_samples, 1.5):
             return self._render()["Combined"][..., 3]
 
     def labels_and_depth(self) -> tuple[np.ndarray, np.ndarray]:

@@ -60,10 +60,10 @@ def render_collection(
     `views` are orbit angles in degrees of held-out cameras, one extra picture a clip each. `truth`
     "full" adds the posed vertices and depth to the parameters, labels and mattes. `performance`
     numbers what the person does, before which camera: the same person in the same looks is filmed
-    doing other things. progress(fraction, step=what). The result depends on the arguments
-    only. Raises InputError.
+    doing other things. `samples`: of a pixel (`Passes.expose`). progress(fraction, step=what).
+    The result depends on the arguments only. Raises InputError.
     """
-    _check(appearances, frames, size, performance, truth, first)
+    _check(appearances, frames, size, performance, truth, first, 1 if samples is None else samples)
     head = builtin_head()
     person = build_person(head, identity(head, seed))
     looks = APPEARANCES[first - 1 :][:appearances]
@@ -73,13 +73,15 @@ def render_collection(
         "performance": performance,
         "head_fingerprint": head.fingerprint,
     }  # fmt: skip
+    if samples is not None:
+        extra["samples"] = samples
     with CollectionWriter(out, "builtin", person.betas, extra=extra, overwrite=overwrite) as writer:
         for look in looks:
             shots = plan(person, look, frames, size, (seed, performance), views)
             vertices = []
-            with filming(person, look, size, seed, samples) as take:
+            with filming(person, look, size, seed) as take:
                 for shot in shots:
-                    picture = take(shot)
+                    picture = take(shot, samples)
                     writer.image(look.name, shot.frame_id, picture.rgba)
                     writer.labels(look.name, shot.frame_id, picture.labels)
                     if truth == "full":
@@ -89,7 +91,8 @@ def render_collection(
                     if progress:
                         progress(done / total, step=f"filming {look.name} {shot.frame_id}")
             writer.clip(_clip(look, shots, size, vertices))
-        note = _note(appearances, frames, size, (seed, performance), truth, len(views), first)
+        others = {"performance": performance, "first": first, "samples": samples}
+        note = _note(appearances, frames, size, seed, truth, len(views), others)
         write_text(writer.root / "README.md", note)
     return Path(out)
 
@@ -98,21 +101,20 @@ def _note(
     appearances: int,
     frames: int,
     size: int,
-    seeds: tuple[int, int],
+    seed: int,
     truth: str,
     views: int,
-    first: int,
+    others: dict[str, int | None],
 ) -> str:
     """What the folder is, how it was made, and whose it is."""
-    seed, performance = seeds
-    other = f" --performance {performance}" if performance else ""
-    begun = "" if first == 1 else f" --first {first}"
+    usual = {"performance": 0, "first": 1, "samples": None}
+    more = "".join(f" --{name} {n}" for name, n in others.items() if n != usual[name])
     return f"""# A synthetic person in {appearances} appearances
 
 Made by one command; nobody was filmed:
 
     pav studio THIS_FOLDER --appearances {appearances} --frames {frames} --size {size} \\
-        --seed {seed}{other} --truth {truth}{begun}
+        --seed {seed} --truth {truth}{more}
 
 One clip an appearance: {frames} frames of one performance (the last sixth is held out: split
 "test") and {views} pictures from cameras that no clip used (split "view"). Cycles renders the
@@ -125,7 +127,13 @@ Licence: CC0 1.0 (public domain), https://creativecommons.org/publicdomain/zero/
 
 
 def _check(
-    appearances: int, frames: int, size: int, performance: int, truth: str, first: int
+    appearances: int,
+    frames: int,
+    size: int,
+    performance: int,
+    truth: str,
+    first: int,
+    samples: int,
 ) -> None:
     for what, value, low, high in (
         ("first", first, 1, len(APPEARANCES)),
@@ -133,6 +141,7 @@ def _check(
         ("frames", frames, 2, 100_000),
         ("size", size, 32, 4096),
         ("performance", performance, 0, 100_000),
+        ("samples", samples, 1, 65_536),
     ):
         if not low <= value <= high:
             raise InputError(f"{what} {value}: give {low} to {high}")
@@ -187,15 +196,21 @@ def orbit(target: np.ndarray, distance: float, azimuth: float, elevation: float)
 
 @contextlib.contextmanager
 def filming(
-    person: Person, look: Appearance, size: int, seed: int, samples: int | None = None
-) -> Iterator[Callable[[Shot], Picture]]:
-    """Builds the appearance's scene; yields a function that takes one picture."""
+    person: Person, look: Appearance, size: int, seed: int
+) -> Iterator[Callable[[Shot, int | None], Picture]]:
+    """Builds the appearance's scene; yields a function that takes one picture: of a shot, with so
+    many samples (`Passes.expose`)."""
     with contextlib.ExitStack() as stack:
         studio = build_scene(person, look, seed)
         stack.callback(studio.close)
-        passes = Passes(studio.scene, size, samples)
+        passes = Passes(studio.scene, size)
         stack.callback(passes.close)
-        yield lambda shot: _take(studio, passes, shot, size)
+
+        def take(shot: Shot, samples: int | None) -> Picture:
+            passes.expose(samples)
+            return _take(studio, passes, shot, size)
+
+        yield take
 
 
 def _take(studio: StudioScene, passes: Passes, shot: Shot, size: int) -> Picture:

@@ -22,6 +22,7 @@ NAMES = (
     "memory",
     "devices",
     "matte",
+    "studio",
     "track",
     "viewport",
 )

@@ -157,6 +157,22 @@ def test_hair_edges_keep_the_foregrounds_colour(small):
     assert np.abs(difference).max() < 40
 
 
+def test_more_samples_are_nearer_to_the_converged_picture(tmp_path, monkeypatch, capsys):
+    from pav_blender.benchmarks import studio
+    from pav_blender.benchmarks.measure import Options
+
+    monkeypatch.setattr(studio, "_LOOKS", 1)
+    monkeypatch.setattr(studio, "_SIZE", 64)
+    monkeypatch.setattr(studio, "_SAMPLES", (2, 32))
+    monkeypatch.setattr(studio, "_CONVERGED", 96)
+    fields, claims = studio.run(Options(tmp_path), None)
+    few, many = fields["rows"]
+    assert few["head_psnr"] + 3 < many["head_psnr"] < 70
+    assert claims[0].value == pytest.approx(few["head_psnr"], abs=1e-3)
+    assert "head_psnr" in capsys.readouterr().out
+    assert (tmp_path / "studio.svg").is_file()
+
+
 def test_nothing_stays_in_blender(small):
     assert not [item.name for item in bpy.data.objects if item.name.startswith("studio")]
     assert not [item.name for item in bpy.data.materials if item.name.startswith("studio")]
@@ -164,7 +180,13 @@ def test_nothing_stays_in_blender(small):
 
 
 def test_wrong_requests_are_refused(tmp_path):
-    for options in ({"appearances": 6}, {"frames": 0}, {"size": 8}, {"truth": "half"}):
+    for options in (
+        {"appearances": 6},
+        {"frames": 0},
+        {"size": 8},
+        {"truth": "half"},
+        {"samples": 0},
+    ):
         with pytest.raises(InputError):
             render_collection(tmp_path / "refused", **options)
     assert not list(tmp_path.iterdir())
@@ -186,7 +208,7 @@ def test_the_committed_collection_renders_again():
             planned = np.stack([getattr(shot, key) for shot in shots]).astype(np.float32)
             np.testing.assert_allclose(planned, getattr(clip, key), rtol=1e-6, atol=1e-8)
         with render.filming(person, look, clip.width, extra["seed"]) as take:
-            picture = take(shots[row])
+            picture = take(shots[row], None)
         stored = read_rgba(collection.image_path(clip, row)).astype(float)
         mine = picture.rgba.astype(float)
         over = [c[..., :3] * c[..., 3:] / 255 for c in (stored, mine)]
