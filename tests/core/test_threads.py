@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import threading
+import time
 
 import pytest
 
-from pav_blender.core.kernels.cpu.threads import run_chunks
+from pav_blender.core.kernels.cpu.threads import each, run_chunks
 
 
 @pytest.fixture(autouse=True)
@@ -66,3 +67,30 @@ def test_the_first_error_comes_out_and_the_pool_goes_on():
 
     run_chunks(meet, 3, 1)
     assert len(threads) == 2
+
+
+def test_each_keeps_the_order_and_makes_the_first_alone():
+    """Also of what is first called within: numba aborts where two threads bring a new type."""
+    inside, most = 0, []
+    lock = threading.Lock()
+
+    def inner(start: int, stop: int) -> None:
+        nonlocal inside
+        with lock:
+            inside += 1
+            most.append(inside)
+        time.sleep(0.01)
+        with lock:
+            inside -= 1
+
+    met = threading.Barrier(2, timeout=10)
+
+    def outer(index: int) -> int:
+        if index in (1, 2):
+            met.wait()  # these two are at work at once, and both call what nobody has called
+            run_chunks(inner, 1, 1)
+        return index * index
+
+    assert each(outer, 6) == [0, 1, 4, 9, 16, 25]
+    assert most == [1, 1]
+    assert each(outer, 0) == []

@@ -1,7 +1,9 @@
 """From video files to a collection: decoding, observing, cropping, mattes, and what goes wrong."""
 
 import os
+import struct
 import sys
+import threading
 from fractions import Fraction
 from pathlib import Path
 
@@ -116,24 +118,20 @@ def test_pixels_that_are_not_square_are_made_so(tmp_path):
     assert next(open_video(path).frames()).rgb.shape == (HEIGHT, 2 * WIDTH, 3)
 
 
-@pytest.mark.parametrize(("degrees", "corner"), [(90, (-1, 0)), (180, (-1, -1)), (-90, (0, -1))])
-def test_pictures_are_turned_upright(steps, monkeypatch, degrees, corner):
-    class Turned:
-        """A decoded frame with a display matrix (counterclockwise degrees)."""
-
-        rotation = degrees
-
-        def __init__(self, frame):
-            self.width, self.height, self.to_ndarray = frame.width, frame.height, frame.to_ndarray
-
-    from pav_blender.core.tracking import decode
-
-    original = decode._decoded
-    monkeypatch.setattr(
-        decode, "_decoded", lambda packet: (Turned(frame) for frame in original(packet))
-    )
-    rgb = next(open_video(steps).frames()).rgb
-    assert rgb.shape[:2] == ((HEIGHT, WIDTH) if degrees == 180 else (WIDTH, HEIGHT))
+# the first two rows of the display matrix in a file of a telephone held upright, and so on
+@pytest.mark.parametrize(
+    ("clockwise", "matrix", "corner"),
+    [(90, (0, 1, -1, 0), (0, -1)), (180, (-1, 0, 0, -1), (-1, -1)), (270, (0, -1, 1, 0), (-1, 0))],
+)
+def test_pictures_are_turned_upright(steps, tmp_path, clockwise, matrix, corner):
+    content = bytearray(steps.read_bytes())
+    place = content.index(b"tkhd") + 44  # the track's header, then times, layer and volume
+    a, b, c, d = (value << 16 for value in matrix)
+    content[place : place + 36] = struct.pack(">9i", a, b, 0, c, d, 0, 0, 0, 1 << 30)
+    path = tmp_path / "turned.mp4"
+    path.write_bytes(content)
+    rgb = next(open_video(path).frames()).rgb
+    assert rgb.shape[:2] == ((HEIGHT, WIDTH) if clockwise == 180 else (WIDTH, HEIGHT))
     assert rgb[corner].min() > 200
     assert (rgb > 200).all(axis=2).sum() == pytest.approx(30 * 40, rel=0.1)
 
@@ -197,6 +195,26 @@ def test_a_landmark_model_that_is_none_is_refused(steps, tmp_path):
 def test_quiet_keeps_native_chatter_and_gives_the_stream_back(capfd):
     with quiet():
         os.write(2, b"chatter")
+    os.write(2, b"kept")
+    assert capfd.readouterr().err == "kept"
+
+
+def test_threads_that_are_quiet_at_once_give_the_stream_back(capfd):
+    """Each alone would keep what the other silenced, or silence what the other gave back."""
+    entered, left = threading.Barrier(2), threading.Event()
+
+    def first():
+        with quiet():
+            entered.wait(10)
+        left.set()
+
+    thread = threading.Thread(target=first)
+    thread.start()
+    with quiet():
+        entered.wait(10)
+        assert left.wait(10)
+        os.write(2, b"chatter")
+    thread.join()
     os.write(2, b"kept")
     assert capfd.readouterr().err == "kept"
 

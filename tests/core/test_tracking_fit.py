@@ -225,21 +225,21 @@ def test_point_model_is_the_heads_and_its_derivatives_are_exact(head, corrective
         for sign in (1, -1):
             moved = list(values)
             moved[index] = values[index] + sign * 1e-6 * change
-            both.append(np.einsum("fldx,flx->fdl", outer, model.pose(*moved).points))
+            both.append(np.einsum("fldx,flx->fld", outer, model.pose(*moved).points))
         return (both[0] - both[1]) / 2e-6
 
     for column in (0, 5):
         change = np.eye(6)[column]
-        assert np.abs(slope(0, change) - slopes.shape[:, column]).max() < 1e-5
+        assert np.abs(slope(0, change) - slopes.shape[..., column]).max() < 1e-5
     change = np.zeros_like(expression)
     change[:, 7] = 1
-    assert np.abs(slope(1, change) - slopes.expression[:, 7]).max() < 1e-5
+    assert np.abs(slope(1, change) - slopes.expression[..., 7]).max() < 1e-5
     for joint in range(5):
         for axis in range(3):
             change = np.zeros_like(pose)
             change[:, joint, axis] = 1
-            assert np.abs(slope(2, change) - slopes.pose[:, joint, axis]).max() < 1e-5
-    assert np.abs(slope(3, np.array([0, 1, 0.0])) - slopes.translation[:, 1]).max() < 1e-5
+            assert np.abs(slope(2, change) - slopes.pose[..., 3 * joint + axis]).max() < 1e-5
+    assert np.abs(slope(3, np.array([0, 1, 0.0])) - slopes.translation[..., 1]).max() < 1e-5
 
 
 def test_rotations_and_their_derivatives_near_zero():

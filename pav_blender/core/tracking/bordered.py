@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded
 
+from ..kernels.cpu.threads import each
+
 
 @dataclass(eq=False)
 class Normal:
@@ -38,14 +40,9 @@ def solve(clips: list[Normal], damping: float) -> tuple[list[np.ndarray], np.nda
     total = sum(clip.shared for clip in clips)
     total = total + damping * np.diag(np.diag(total))
     right = sum(clip.shared_gradient for clip in clips)
-    partial = []
-    for clip in clips:
-        frames, size, shared = clip.border.shape
-        factor = cholesky_banded(_band(clip, damping), lower=True, overwrite_ab=True)
-        both = np.concatenate([clip.gradient[..., None], clip.border], axis=2)
-        solved = cho_solve_banded((factor, True), both.reshape(frames * size, shared + 1))
-        partial.append(solved)
-        border = clip.border.reshape(frames * size, shared)
+    partial = each(lambda index: _alone(clips[index], damping), len(clips))
+    for clip, solved in zip(clips, partial, strict=True):
+        border = clip.border.reshape(len(solved), -1)
         total = total - border.T @ solved[:, 1:]
         right = right - border.T @ solved[:, 0]
     shared_step = -cho_solve(cho_factor(total), right)
@@ -54,6 +51,14 @@ def solve(clips: list[Normal], damping: float) -> tuple[list[np.ndarray], np.nda
         for solved, clip in zip(partial, clips, strict=True)
     ]
     return steps, shared_step
+
+
+def _alone(clip: Normal, damping: float) -> np.ndarray:
+    """The frames' equations solved for the gradient and for the border, [F n, 1 + S]."""
+    frames, size, shared = clip.border.shape
+    factor = cholesky_banded(_band(clip, damping), lower=True, overwrite_ab=True)
+    both = np.concatenate([clip.gradient[..., None], clip.border], axis=2)
+    return cho_solve_banded((factor, True), both.reshape(frames * size, shared + 1))
 
 
 def _band(clip: Normal, damping: float) -> np.ndarray:

@@ -66,6 +66,8 @@ class Video:
         with _open(self.path) as container:
             stream = _video_stream(container, self.path)
             ratio = _pixel_aspect(stream)
+            # one for all frames: a frame's own begins anew, which takes longer than decoding
+            reformatter = _av().video.reformatter.VideoReformatter()
             for packet in _packets(container, stream):
                 if packet is None:
                     ended_early = True
@@ -80,7 +82,7 @@ class Video:
                     # the first one always, for its size is the clip's
                     if size is not None and (number <= start or (number - 1) % every):
                         continue
-                    rgb = _upright(picture, ratio)
+                    rgb = _upright(picture, ratio, reformatter)
                     size = size or rgb.shape
                     if rgb.shape != size:
                         skipped += 1
@@ -173,11 +175,11 @@ def _pixel_aspect(stream: Any) -> float:
     return ratio if 0.1 < ratio < 10 else 1.0
 
 
-def _upright(picture: Any, ratio: float) -> np.ndarray:
+def _upright(picture: Any, ratio: float, reformatter: Any) -> np.ndarray:
     """Square pixels, then turned as the file's display matrix says."""
     width = max(1, round(picture.width * ratio))
     if 3 * width * picture.height > _LARGEST:
         raise InputError(f"a video of {width}x{picture.height} pixels is not read")
-    rgb = picture.to_ndarray(format="rgb24", width=width, height=picture.height)
+    rgb = reformatter.reformat(picture, width, picture.height, "rgb24").to_ndarray()
     quarter_turns = round(getattr(picture, "rotation", 0) / 90) % 4
     return np.ascontiguousarray(np.rot90(rgb, quarter_turns))

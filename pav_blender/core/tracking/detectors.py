@@ -7,6 +7,7 @@ import functools
 import hashlib
 import importlib
 import os
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -80,22 +81,39 @@ def load_mediapipe() -> Any:
         raise InputError(f"tracking needs MediaPipe, which is missing: {INSTALL}") from error
 
 
+_quiet = threading.Lock()
+_hushed: list[int] = []  # what standard error was, once for each that is quiet now
+
+
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
-    """Drops what native code prints on standard error; MediaPipe has no switch for it."""
+    """Drops what native code prints on standard error; MediaPipe has no switch for it. The first
+    to come silences it for all threads, and the last to leave gives it back."""
+    with _quiet:
+        if _hushed:
+            _hushed.append(_hushed[0])
+        else:
+            _hushed.append(_silenced())
     try:
-        saved = os.dup(2)
-    except OSError:  # no standard error, as in some windowed programs
-        yield
-        return
-    sink = os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(sink, 2)
         yield
     finally:
-        os.dup2(saved, 2)
-        os.close(saved)
-        os.close(sink)
+        with _quiet:
+            saved = _hushed.pop()
+            if not _hushed and saved >= 0:
+                os.dup2(saved, 2)
+                os.close(saved)
+
+
+def _silenced() -> int:
+    """Standard error's copy; -1 where there is none, as in some windowed programs."""
+    try:
+        saved = os.dup(2)
+    except OSError:
+        return -1
+    sink = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(sink, 2)
+    os.close(sink)
+    return saved
 
 
 def _points(landmarks: Any) -> np.ndarray:

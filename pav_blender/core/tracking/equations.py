@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..kernels.cpu.threads import run_chunks
+from ..kernels.cpu.threads import each
 from . import bordered, priors
 from .landmark_model import PointModel
 from .terms import ClipFit, Term
@@ -60,8 +60,12 @@ def cost(problem: Problem, betas: np.ndarray, clips: list[ClipFit]) -> float:
     prior = problem.prior
     grown = float(problem.model.growth @ betas) / priors.SIZE_SPREAD
     total = _looks(clips) * (float((betas**2).sum()) + grown**2)
-    for expected, terms, fit in zip(problem.expected, problem.terms, clips, strict=True):
-        total += sum(term.cost(betas, fit) for term in terms)
+    missed = each(
+        lambda index: sum(term.cost(betas, clips[index]) for term in problem.terms[index]),
+        len(clips),
+    )
+    for expected, misses, fit in zip(problem.expected, missed, clips, strict=True):
+        total += misses
         values = unknowns(fit)
         total += float((expected.weight * (values - expected.mean) ** 2).sum())
         for i, j, stiff in prior.pairs:
@@ -84,13 +88,7 @@ def _bends(values: np.ndarray, triples: np.ndarray) -> np.ndarray:
 
 def step(problem: Problem, betas: np.ndarray, clips: list[ClipFit]) -> list[bordered.Normal]:
     """The normal equations, a clip each; the first carries the shared unknowns' priors."""
-    normals: list[bordered.Normal] = [None] * len(clips)  # type: ignore[list-item]
-
-    def make(start: int, stop: int) -> None:
-        for index in range(start, stop):
-            normals[index] = _normal(problem, index, betas, clips)
-
-    run_chunks(make, len(clips), 1)
+    normals = each(lambda index: _normal(problem, index, betas, clips), len(clips))
     _add_shared_priors(problem, normals[0], betas, clips)
     return normals
 
@@ -115,9 +113,9 @@ def _normal(
         rows = slice(start, start + _CHUNK)
         for term in problem.terms[index]:
             residual, slopes = term.linearised(betas, fit, rows)
-            slopes = slopes.reshape(*slopes.shape[:2], -1)
-            product = (slopes @ slopes.transpose(0, 2, 1)).astype(np.float64)
-            pull = (slopes @ residual.reshape(len(slopes), -1, 1))[..., 0].astype(np.float64)
+            across = slopes.transpose(0, 2, 1)
+            product = (across @ slopes).astype(np.float64)
+            pull = (across @ residual[..., None])[..., 0].astype(np.float64)
             own[rows] += product[:, :size, :size]
             border[rows, :, columns] += product[:, :size, size:]
             gradient[rows] += pull[:, :size]

@@ -14,6 +14,7 @@ import numpy as np
 
 from ..errors import Cancelled, PavError
 from ..head import HeadModel
+from ..kernels.cpu.threads import each
 from . import priors
 from .equations import Expected, Problem, cost, step, stepped
 from .landmark_model import LandmarkModel, axis_angles, rotations
@@ -132,8 +133,7 @@ def refine_head(
     state = _State(fit.betas, fit.clips)
 
     def look(state: _State) -> None:
-        for photo, clip in zip(photos, state.clips, strict=True):
-            photo.look(state.betas, clip)
+        each(lambda index: photos[index].look(state.betas, state.clips[index]), len(photos))
         if len(photos) > 1:
             shared = common_look([(p.template, p.certainty) for p in photos])  # type: ignore[misc]
             for photo in photos:
@@ -183,9 +183,7 @@ def _descend(
             raise Cancelled("tracking stopped; the same command goes on from here")
         if before_step is not None:
             before_step(state)
-        for terms, clip in zip(problem.terms, state.clips, strict=True):
-            for term in terms:
-                term.weigh(state.betas, clip)
+        _weigh(problem, state)
         before = cost(problem, state.betas, state.clips)
         normals = step(problem, state.betas, state.clips)
         for _ in range(8):
@@ -203,6 +201,14 @@ def _descend(
             break
         previous = before
     return state
+
+
+def _weigh(problem: Problem, state: _State) -> None:
+    def weigh(index: int) -> None:
+        for term in problem.terms[index]:
+            term.weigh(state.betas, state.clips[index])
+
+    each(weigh, len(state.clips))
 
 
 def _filled_in(fit: ClipFit, rows: np.ndarray, frames: int) -> ClipFit:

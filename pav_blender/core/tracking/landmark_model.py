@@ -48,7 +48,7 @@ class Posed:
     """points [F,L,3] metres; and what `LandmarkModel.jacobian` needs to go on."""
 
     points: np.ndarray
-    parts: np.ndarray  # [F,J,3,L]: each joint's share of a point, translation left out
+    parts: np.ndarray  # [F,U,3,L]: each used joint's share of a point, translation left out
     turns: np.ndarray  # [F,J,3,3] joints' rotations in the world
     places: np.ndarray  # [F,J,3] joints' positions, translation left out
     local: np.ndarray  # [F,J,3,3] joints' own rotations
@@ -76,6 +76,9 @@ class PointModel:
         self.corners = corners = head.triangles[triangles]  # [L,3]
         mix = self.barycentrics
         skin = mix[..., None] * head.skinning_weights[corners]  # [L,3,J]
+        # the joints that move any of the points at all: on skin, no eyes
+        self.used = np.flatnonzero(skin.any(axis=(0, 1)))
+        skin = skin[..., self.used]  # [L,3,U]
         self.shapes = min(shapes, len(head.shape_basis))
         self.expressions = len(head.expression_basis)
         self.correctives = len(head.pose_basis)
@@ -86,12 +89,12 @@ class PointModel:
                 head.pose_basis[:, corners],
             ]
         ).astype(np.float64)  # [K,L,3,3]
-        self.share = np.ascontiguousarray(skin.sum(axis=1).T)  # [J,L]
+        self.share = np.ascontiguousarray(skin.sum(axis=1).T)  # [U,L]
         rest = head.template[corners].astype(np.float64)
         self.rest = np.einsum("lvj,lvx->jxl", skin, rest)
         if offsets is not None:
             self.rest += self.share[:, None] * offsets.astype(np.float64).T
-        self.basis = np.einsum("lvj,klvx->kjxl", skin, bases, optimize=True)  # [K,J,3,L]
+        self.basis = np.einsum("lvj,klvx->kjxl", skin, bases, optimize=True)  # [K,U,3,L]
         regressor = head.joint_regressor.astype(np.float64)
         self.joint_rest = regressor @ head.template
         self.joint_basis = np.einsum(
@@ -99,7 +102,8 @@ class PointModel:
         )
         self.parents = head.joint_parents.tolist()
         self.joints = len(self.parents)
-        self.subtree = _subtrees(self.parents)
+        # of the used ones, those that turn with each joint
+        self.below = [np.flatnonzero(np.isin(self.used, tree)) for tree in _subtrees(self.parents)]
 
     @cached_property
     def normals(self) -> np.ndarray:
@@ -126,9 +130,9 @@ class PointModel:
 
     @cached_property
     def _by_landmark(self) -> np.ndarray:
-        """The bases as [L, J*3, K] float32: derivatives do not need more."""
+        """The bases as [L, U*3, K] float32: derivatives do not need more."""
         count = self.basis.shape[-1]
-        by_landmark = self.basis.transpose(3, 1, 2, 0).reshape(count, 3 * self.joints, -1)
+        by_landmark = self.basis.transpose(3, 1, 2, 0).reshape(count, 3 * len(self.used), -1)
         return np.ascontiguousarray(by_landmark, np.float32)
 
     def pose(
@@ -155,7 +159,8 @@ class PointModel:
         own = known @ self.basis.reshape(len(self.basis), -1)
         own = own.reshape(frames, *self.rest.shape) + self.rest
         shift = place - (turn @ joints[..., None])[..., 0]
-        parts = turn @ own + shift[..., None] * self.share[:, None]
+        used = self.used
+        parts = turn[:, used] @ own + shift[:, used, :, None] * self.share[:, None]
         points = parts.sum(axis=1).transpose(0, 2, 1) + translation[:, None]
         return Posed(points, parts, turn, place, local)
 
@@ -163,14 +168,17 @@ class PointModel:
         """Derivatives of `outer @ point`, outer [F,L,D,3] (a projection's own derivative)."""
         outer = outer.astype(np.float32)
         frames, count, rows = outer.shape[:3]
-        turns = posed.turns.astype(np.float32).transpose(0, 2, 1, 3).reshape(frames, 3, -1)
-        turned = (outer.reshape(frames, count * rows, 3) @ turns).reshape(frames, count, rows, -1)
-        linear = turned.transpose(1, 0, 2, 3).reshape(count, frames * rows, -1) @ self._by_landmark
-        linear = linear.reshape(count, frames, rows, -1).transpose(1, 3, 2, 0)
-        outer = np.ascontiguousarray(outer.transpose(0, 2, 3, 1))  # [F,D,3,L]
-        shape = linear[:, : self.shapes] + self._joint_effect(posed, outer)
-        expression = linear[:, self.shapes : self.shapes + self.expressions]
+        turns = posed.turns[:, self.used].astype(np.float32)
+        turned = outer.reshape(frames, count * rows, 3) @ turns.transpose(0, 2, 1, 3).reshape(
+            frames, 3, -1
+        )
+        turned = turned.reshape(frames, count, rows, -1).transpose(1, 0, 2, 3)
+        linear = turned.reshape(count, frames * rows, -1) @ self._by_landmark
+        linear = linear.reshape(count, frames, rows, -1).transpose(1, 0, 2, 3)
+        shape = linear[..., : self.shapes] + self._joint_effect(posed, outer)
+        expression = linear[..., self.shapes : self.shapes + self.expressions]
         swings = rotation_derivatives(pose, posed.local)  # [F,J,3(k),3,3]
+        across = np.ascontiguousarray(outer.transpose(0, 2, 3, 1))  # [F,D,3,L]
         columns = np.empty((frames, self.joints, 3, rows, count), np.float32)
         for joint in range(self.joints):
             parent = self.parents[joint]
@@ -179,31 +187,34 @@ class PointModel:
             )
             back = posed.turns[:, joint].transpose(0, 2, 1)
             spin = before[:, None] @ swings[:, joint] @ back[:, None]  # [F,3(k),3,3]
-            below = self.subtree[joint]
+            below = self.below[joint]
             lever = posed.parts[:, below].sum(axis=1)
             lever -= self.share[below].sum(axis=0) * posed.places[:, joint, :, None]
             swept = (spin @ lever[:, None]).astype(np.float32)  # [F,3(k),3,L]
-            columns[:, joint] = (outer[:, None] * swept[:, :, None]).sum(axis=3)
+            columns[:, joint] = (across[:, None] * swept[:, :, None]).sum(axis=3)
             if self.correctives and joint > 0:
                 first = self.shapes + self.expressions + 9 * (joint - 1)
-                bent = linear[:, first : first + 9].reshape(frames, 9, -1)
+                bent = linear[..., first : first + 9].reshape(frames, count * rows, 9)
                 swung = swings[:, joint].reshape(frames, 3, 9).astype(np.float32)
-                columns[:, joint] += (swung @ bent).reshape(frames, 3, rows, count)
-        return Jacobian(shape, expression, columns, outer.transpose(0, 2, 1, 3))
+                bent = (bent @ swung.transpose(0, 2, 1)).reshape(frames, count, rows, 3)
+                columns[:, joint] += bent.transpose(0, 3, 2, 1)
+        columns = columns.reshape(frames, 3 * self.joints, rows, count).transpose(0, 3, 2, 1)
+        return Jacobian(shape, expression, columns, outer)
 
     def _joint_effect(self, posed: Posed, outer: np.ndarray) -> np.ndarray:
-        """How identity moves landmarks by moving the joints they turn about, [F,B,D,L]."""
+        """How identity moves landmarks by moving the joints they turn about, [F,L,D,B]."""
         moved = [np.broadcast_to(self.joint_basis[0], (len(outer), *self.joint_basis[0].shape))]
         for joint in range(1, self.joints):
             parent = self.parents[joint]
             bone = self.joint_basis[joint] - self.joint_basis[parent]
             moved.append(moved[parent] + posed.turns[:, parent] @ bone)
-        shift = np.stack(moved, 1) - posed.turns @ self.joint_basis  # [F,J,3,B]
-        frames, rows, _, count = outer.shape
-        pulled = outer.transpose(0, 3, 1, 2)[:, :, :, None] * self.share.T[:, None, :, None]
-        pulled = pulled.astype(np.float32).reshape(frames, count * rows, -1)  # [F,L*D,J*3]
-        drift = pulled @ shift.astype(np.float32).reshape(frames, -1, self.shapes)
-        return drift.reshape(frames, count, rows, -1).transpose(0, 3, 2, 1)
+        shift = (np.stack(moved, 1) - posed.turns @ self.joint_basis)[:, self.used]  # [F,U,3,B]
+        frames, count, rows, _ = outer.shape
+        pulled = outer[:, :, :, None] * self.share.T[:, None, :, None].astype(np.float32)
+        drift = pulled.reshape(frames, count * rows, -1) @ shift.astype(np.float32).reshape(
+            frames, -1, self.shapes
+        )
+        return drift.reshape(frames, count, rows, self.shapes)
 
 
 class LandmarkModel(PointModel):
@@ -259,8 +270,8 @@ def _is_builtin(head: HeadModel) -> bool:
 
 @dataclass(eq=False)
 class Jacobian:
-    """shape [F,shapes,D,L], expression [F,E,D,L], pose [F,J,3,D,L] by axis-angle components,
-    translation [F,3,D,L]; float32."""
+    """shape [F,L,D,shapes], expression [F,L,D,E], pose [F,L,D,J 3] by axis-angle components,
+    translation [F,L,D,3]; float32."""
 
     shape: np.ndarray
     expression: np.ndarray

@@ -16,7 +16,7 @@ import torch
 from torch.nn import functional
 
 from ..errors import InputError
-from ..kernels.cpu.threads import run_chunks
+from ..kernels.cpu.threads import each, run_chunks
 from .detectors import INSTALL, load_mediapipe, quiet
 
 MASK_SIDE = 256
@@ -44,10 +44,11 @@ class Segmenter:
                 f"{INSTALL}, or track with --matte none for clips without a background"
             )
         with quiet():
-            self._network: Any = mediapipe.solutions.selfie_segmentation.SelfieSegmentation(
-                model_selection=0
-            )
-            self._network.process(np.zeros((64, 64, 3), np.uint8))
+            make = mediapipe.solutions.selfie_segmentation.SelfieSegmentation
+            # one for each look, so that both can be taken at once
+            self._networks: list[Any] = [make(model_selection=0), make(model_selection=0)]
+            for network in self._networks:
+                network.process(np.zeros((64, 64, 3), np.uint8))
 
     def __call__(self, rgb: np.ndarray) -> np.ndarray:
         """float32 [S,S,3] in [0,1] -> uint8 [256,256], 255 = person.
@@ -55,18 +56,20 @@ class Segmenter:
         The mean of the picture's mask and its mirror image's: their mistakes differ.
         """
         pixels = (rgb * 255 + 0.5).astype(np.uint8)
-        mirrored = np.ascontiguousarray(pixels[:, ::-1])
-        mask = 0.5 * (self._mask(pixels) + self._mask(mirrored)[:, ::-1])
+        looks = (pixels, np.ascontiguousarray(pixels[:, ::-1]))
+        plain, mirrored = each(lambda look: self._mask(look, looks[look]), 2)
+        mask = 0.5 * (plain + mirrored[:, ::-1])
         small = _resized(torch.from_numpy(mask)[None, None], MASK_SIDE)
         return (small[0, 0].clip(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
 
-    def _mask(self, pixels: np.ndarray) -> np.ndarray:
+    def _mask(self, look: int, pixels: np.ndarray) -> np.ndarray:
         with quiet():
-            return np.array(self._network.process(pixels).segmentation_mask, np.float32)
+            return np.array(self._networks[look].process(pixels).segmentation_mask, np.float32)
 
     def close(self) -> None:
         with quiet():
-            self._network.close()
+            for network in self._networks:
+                network.close()
 
 
 def segmenter_name() -> str:

@@ -10,6 +10,7 @@ from itertools import islice
 import numpy as np
 
 from ..errors import Cancelled, InputError
+from ..kernels.cpu.threads import each
 from .cache import Cache
 from .crop import edges, resize
 from .decode import Frame, Source
@@ -158,10 +159,8 @@ def _chunk(
     should_stop: Callable[[], bool] | None,
 ) -> dict[str, np.ndarray]:
     """The next CHUNK frames, after a second look at the `recent` ones, which it renews."""
-    detector, hand_detector = detectors
     for frame in recent:
-        _faces(detector, frame.rgb)
-        _hands(hand_detector, frame.rgb)
+        _seen(detectors, frame.rgb)
     lists: dict[str, list] = {name: [] for name in (*_ARRAYS, "tall", "wide")}
     size: tuple[int, ...] = (0, 0)
     count = 0
@@ -171,8 +170,9 @@ def _chunk(
         size = frame.rgb.shape[:2]
         lists["frame_id"].append(frame.number)
         lists["thumbs"].append(_thumb(frame.rgb))
-        lists["hands"].append(_hands(hand_detector, frame.rgb))
-        for landmarks, scores in _faces(detector, frame.rgb):
+        faces, hands = _seen(detectors, frame.rgb)
+        lists["hands"].append(hands)
+        for landmarks, scores in faces:
             lists["row"].append(count)
             lists["landmarks"].append(landmarks)
             lists["scores"].append(np.zeros(0, np.float32) if scores is None else scores)
@@ -185,7 +185,7 @@ def _chunk(
         count += 1
         tell(count)
     arrays = {name: np.asarray(values) for name, values in lists.items()}
-    names = detector.score_names
+    names = detectors[0].score_names
     # a scripted or a failing network may score some faces only
     if len({len(scores) for scores in lists["scores"]}) > 1:
         arrays["scores"], names = np.zeros((len(lists["row"]), 0), np.float32), ()
@@ -231,7 +231,20 @@ def _joined(chunks: list[dict[str, np.ndarray]], source: Source) -> Sightings:
     )
 
 
-def _faces(detector: Detector, rgb: np.ndarray) -> list[tuple[np.ndarray, np.ndarray | None]]:
+_Found = list[tuple[np.ndarray, np.ndarray | None]]
+
+
+def _seen(
+    detectors: tuple[Detector, HandDetector | None], rgb: np.ndarray
+) -> tuple[_Found, np.ndarray]:
+    """What `_faces` and `_hands` find, looked for at once."""
+    detector, hand_detector = detectors
+    looks = (lambda: _faces(detector, rgb), lambda: _hands(hand_detector, rgb))
+    faces, hands = each(lambda index: looks[index](), 2)
+    return faces, hands
+
+
+def _faces(detector: Detector, rgb: np.ndarray) -> _Found:
     """Landmarks in pixels, and scores, of each face."""
     height, width = rgb.shape[:2]
     side = max(height, width)

@@ -130,16 +130,20 @@ def _sample(features, at, values, gradient, inside, start, stop):  # type: ignor
     for f in range(start, stop):
         for k in range(at.shape[1]):
             x, y = at[f, k, 0], at[f, k, 1]
-            if not (1 <= x < side - 2 and 1 <= y < side - 2):
-                continue
+            within = 1 <= x < side - 2 and 1 <= y < side - 2
+            if not within:
+                # the nearest place within; NaN becomes the first
+                x = min(x, side - 2.5) if x > 1.0 else 1.0
+                y = min(y, side - 2.5) if y > 1.0 else 1.0
             i, j = int(y), int(x)
             v, u = np.float32(y - i), np.float32(x - j)
             a, b = np.float32(features[f, i, j]), np.float32(features[f, i, j + 1])
             c, d = np.float32(features[f, i + 1, j]), np.float32(features[f, i + 1, j + 1])
             values[f, k] = (1 - v) * ((1 - u) * a + u * b) + v * ((1 - u) * c + u * d)
-            gradient[f, k, 0] = (1 - v) * (b - a) + v * (d - c)
-            gradient[f, k, 1] = (1 - u) * (c - a) + u * (d - b)
-            inside[f, k] = True
+            if within:
+                gradient[f, k, 0] = (1 - v) * (b - a) + v * (d - c)
+                gradient[f, k, 1] = (1 - u) * (c - a) + u * (d - b)
+            inside[f, k] = within
 
 
 def templates(values: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

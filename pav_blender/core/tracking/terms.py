@@ -6,7 +6,7 @@ unknowns and the shared ones, in the order that `equations` uses.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -15,7 +15,7 @@ from .landmark_model import LandmarkModel, PointModel, Posed
 from .photo import Pictures, sample, templates, visible
 
 # a photo residual is this likely to be new information beside its neighbours'
-_PHOTO_INDEPENDENT = 0.1
+_PHOTO_INDEPENDENT = 0.05
 _FLOOR = 0.05  # of a feature's units: pictures are never alike to less than that
 # pixels of a face's window that skin may be off without counting as something else before it: where
 # a feature is steep it differs much for little, and says most
@@ -35,8 +35,8 @@ class ClipFit:
 
 
 class Term(Protocol):
-    """weigh: finds the weights anew; cost: their weighted squares; linearised: residuals [f,D,L]
-    and slopes [f, n + B + 4, D, L] of some rows, both times the square root of the weights."""
+    """weigh: finds the weights anew; cost: their weighted squares; linearised: residuals [f, L D]
+    and slopes [f, L D, n + B + 4] of some rows, both times the square root of the weights."""
 
     def weigh(self, betas: np.ndarray, fit: ClipFit) -> None: ...
 
@@ -69,17 +69,33 @@ def _posed(model: PointModel, betas: np.ndarray, fit: ClipFit, rows: slice = sli
     return model.pose(betas, fit.expression[rows], fit.pose[rows], fit.translation[rows])
 
 
+class _Poser:
+    """A clip's points where a fit has them. The last are kept, less what derivatives need: a step
+    asks for them when it accepts a fit, and again when it weighs and looks."""
+
+    def __init__(self) -> None:
+        self._last: tuple[np.ndarray, ClipFit, Posed] | None = None
+
+    def __call__(self, model: PointModel, betas: np.ndarray, fit: ClipFit) -> Posed:
+        if self._last is None or self._last[0] is not betas or self._last[1] is not fit:
+            posed = replace(_posed(model, betas, fit), parts=_NOTHING)
+            self._last = betas, fit, posed
+        return self._last[2]
+
+
+_NOTHING = np.zeros(0)
+
+
 def _slopes(
     model: PointModel, posed: Posed, pose: np.ndarray, outer: np.ndarray, by_focal: np.ndarray
 ) -> np.ndarray:
-    """[f, n + B + 4, D, L]: joints but the root, translation, expression; identity, log focal,
-    root. outer [f,L,D,3]; by_focal [f,D,L]."""
+    """[f, L D, n + B + 4]: joints but the root, translation, expression; identity, log focal,
+    root. outer [f,L,D,3]; by_focal [f,L,D]."""
     slopes = model.jacobian(posed, pose, outer)
-    frames, count, rows = outer.shape[:3]
-    turns = slopes.pose.reshape(frames, -1, rows, count)
-    focal = by_focal[:, None].astype(np.float32)
-    own = (turns[:, 3:], slopes.translation, slopes.expression)
-    return np.concatenate([*own, slopes.shape, focal, turns[:, :3]], axis=1)
+    focal = by_focal[..., None].astype(np.float32)
+    own = (slopes.pose[..., 3:], slopes.translation, slopes.expression)
+    together = np.concatenate([*own, slopes.shape, focal, slopes.pose[..., :3]], axis=3)
+    return together.reshape(len(together), -1, together.shape[3])
 
 
 @dataclass(eq=False)
@@ -95,10 +111,11 @@ class Landmarks:
     scatter: float
     weights: np.ndarray | None = None
     aim: np.ndarray | None = None
+    posed: _Poser = field(default_factory=_Poser, init=False)
 
     def weigh(self, betas: np.ndarray, fit: ClipFit) -> None:
         """Trust, less for what turns away from the camera and for what fits badly."""
-        posed = _posed(self.model, betas, fit)
+        posed = self.posed(self.model, betas, fit)
         facing = ((self.model.facing(posed) - 0.05) / 0.4).clip(0.03, 1)
         pixels = project(posed.points, fit.focal)
         strayed = project(posed.points + self.model.strayed(posed), fit.focal)
@@ -112,7 +129,7 @@ class Landmarks:
     def cost(self, betas: np.ndarray, fit: ClipFit) -> float:
         assert self.weights is not None
         assert self.aim is not None
-        missed = project(_posed(self.model, betas, fit).points, fit.focal) - self.aim
+        missed = project(self.posed(self.model, betas, fit).points, fit.focal) - self.aim
         return float((self.weights[..., None] * missed**2).sum())
 
     def linearised(
@@ -122,16 +139,15 @@ class Landmarks:
         assert self.aim is not None
         posed = _posed(self.model, betas, fit, rows)
         pixels = project(posed.points, fit.focal)
-        outer = project_slopes(posed.points, fit.focal)
-        by_focal = pixels.transpose(0, 2, 1)
-        slopes = _slopes(self.model, posed, fit.pose[rows], outer, by_focal)
-        root = np.sqrt(self.weights[rows])[:, None].astype(np.float32)
-        residual = (pixels - self.aim[rows]).transpose(0, 2, 1).astype(np.float32)
-        return residual * root, slopes * root[:, None]
+        root = np.sqrt(self.weights[rows])[..., None]
+        outer = project_slopes(posed.points, fit.focal) * root[..., None]
+        slopes = _slopes(self.model, posed, fit.pose[rows], outer, pixels * root)
+        residual = (pixels - self.aim[rows]) * root
+        return residual.reshape(len(slopes), -1).astype(np.float32), slopes
 
     def distances(self, betas: np.ndarray, fit: ClipFit) -> np.ndarray:
         """Median distance of a frame's landmarks, in pixels, [F]."""
-        posed = _posed(self.model, betas, fit)
+        posed = self.posed(self.model, betas, fit)
         missed = project(posed.points + self.model.strayed(posed), fit.focal) - self.target
         return np.median(np.linalg.norm(missed, axis=2), axis=1)
 
@@ -151,13 +167,13 @@ class Photo:
     certainty: np.ndarray | None = None
     weights: np.ndarray | None = None
     seen: np.ndarray | None = None
-    front: np.ndarray | None = (
-        None  # [F,L] nothing of the head hides it; kept, for it hardly changes
-    )
+    # [F,L] nothing of the head hides it; kept, for it hardly changes
+    front: np.ndarray | None = None
+    posed: _Poser = field(default_factory=_Poser, init=False)
 
     def look(self, betas: np.ndarray, fit: ClipFit) -> None:
         """Finds what is visible, and each point's usual look over the frames."""
-        posed = _posed(self.model, betas, fit)
+        posed = self.posed(self.model, betas, fit)
         facing = ((self.model.facing(posed) - 0.2) / 0.5).clip(0, 1)
         if self.front is None:
             self.front = visible(self.model, betas, fit, posed.points, self.pictures)
@@ -183,10 +199,10 @@ class Photo:
         self.weights = self.weight * _PHOTO_INDEPENDENT * base * robust / usual**2
 
     def cost(self, betas: np.ndarray, fit: ClipFit) -> float:
-        residual, inside = self.residual(betas, fit)
+        residual, _ = self.residual(betas, fit)
         assert self.weights is not None
-        # a point that leaves the picture costs as a bad one does, lest leaving should pay
-        return float((self.weights * np.where(inside, residual, 1.0) ** 2).sum())
+        # a point that leaves the window keeps what its edge shows: a jump would stop all others
+        return float((self.weights * residual**2).sum())
 
     def linearised(
         self, betas: np.ndarray, fit: ClipFit, rows: slice
@@ -196,14 +212,12 @@ class Photo:
         posed = _posed(self.model, betas, fit, rows)
         pixels = project(posed.points, fit.focal)
         values, gradient, inside = sample(self.pictures, pixels, rows)
-        outer = (gradient[..., None, :] @ project_slopes(posed.points, fit.focal)).astype(
-            np.float32
-        )
-        by_focal = (gradient * pixels).sum(axis=2)[:, None]
+        root = np.sqrt(self.weights[rows] * inside)
+        gradient = gradient * root[..., None]
+        outer = gradient[..., None, :] @ project_slopes(posed.points, fit.focal)
+        by_focal = (gradient * pixels).sum(axis=2, keepdims=True)
         slopes = _slopes(self.model, posed, fit.pose[rows], outer, by_focal)
-        root = np.sqrt(self.weights[rows] * inside)[:, None].astype(np.float32)
-        residual = (values - self.template)[:, None].astype(np.float32)
-        return residual * root, slopes * root[:, None]
+        return ((values - self.template) * root).astype(np.float32), slopes
 
     def residual(self, betas: np.ndarray, fit: ClipFit) -> tuple[np.ndarray, np.ndarray]:
         """What the points show more than the template [F,L], and which are in the picture."""
@@ -214,7 +228,7 @@ class Photo:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """As `residual`, and the pictures' gradients [F,L,2] a source pixel."""
         assert self.template is not None
-        posed = _posed(self.model, betas, fit)
+        posed = self.posed(self.model, betas, fit)
         values, gradient, inside = sample(self.pictures, project(posed.points, fit.focal))
         return values - self.template, inside, gradient
 

@@ -8,6 +8,8 @@ are handed out here.
 from __future__ import annotations
 
 import contextlib
+import functools
+import inspect
 import itertools
 import os
 import threading
@@ -23,7 +25,7 @@ _pool: ThreadPoolExecutor | None = None
 _pool_size = 0
 _here = threading.local()
 _ran: set[Any] = set()  # what has run before
-_first = threading.Lock()
+_first = threading.RLock()
 
 
 @contextlib.contextmanager
@@ -61,11 +63,12 @@ if hasattr(os, "register_at_fork"):
 
 @contextlib.contextmanager
 def _busy() -> Iterator[None]:
+    before = getattr(_here, "busy", False)
     _here.busy = True
     try:
         yield
     finally:
-        _here.busy = False
+        _here.busy = before
 
 
 def _bounds(n: int, chunk: int, least: int | None) -> list[int]:
@@ -97,17 +100,17 @@ def run_chunks(
     bounds = _bounds(n, chunk, least)
     pieces = len(bounds) - 1
     workers = 1 if getattr(_here, "busy", False) else min(threads(), pieces)
-    if workers <= 1:
-        for piece in range(pieces):
-            fn(bounds[piece], bounds[piece + 1], *args)
-        return
-    code = getattr(fn, "__code__", fn)
+    code = getattr(inspect.unwrap(fn), "__code__", fn)
     ahead = 0
-    if code not in _ran:
+    if code not in _ran and pieces:
         with _first, _busy():
             fn(0, bounds[1], *args)
         _ran.add(code)
         ahead = 1
+    if workers <= 1:
+        for piece in range(ahead, pieces):
+            fn(bounds[piece], bounds[piece + 1], *args)
+        return
     counter = itertools.count(ahead)
 
     def work() -> None:
@@ -132,3 +135,16 @@ def run_chunks(
         failures = [error for error in (helper.exception() for helper in running) if error]
     if failures:
         raise failures[0]
+
+
+def each(fn: Callable[[int], Any], n: int) -> list[Any]:
+    """`[fn(0), ..., fn(n - 1)]`, made by all threads at once; see `run_chunks`."""
+    found: list[Any] = [None] * n
+
+    @functools.wraps(fn)  # the first call of `fn` goes before all others, not that of `make`
+    def make(start: int, stop: int) -> None:
+        for index in range(start, stop):
+            found[index] = fn(index)
+
+    run_chunks(make, n, 1)
+    return found
