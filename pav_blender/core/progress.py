@@ -39,6 +39,8 @@ class Progress:
         self._last = now
         seconds = now - self._start
         left = self._left(now, fraction)
+        if fraction >= 1:  # what comes after is other work
+            self._start, self._first = now, None
         if self._json:
             message = {"task": self.task, "fraction": round(fraction, 5), **fields}
             message["seconds"] = round(seconds, 2)

@@ -105,6 +105,7 @@ def test_rows_of_a_curve_that_are_no_numbers_are_left_out(tmp_path):
         ([(1.0, 0.6)], None),
         ([(1.0, 0.6), (3.0, 1.0)], 0.0),
         ([(1.0, 1.0)], 0.0),
+        ([(100.0, 1.0), (100.0, 0.0), (110.0, 0.5)], 10.0),  # other work after the first
     ],
 )
 def test_the_time_left_goes_by_the_pace_of_this_run(monkeypatch, calls, left):
