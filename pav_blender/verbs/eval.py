@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +13,7 @@ from ..core.progress import Progress
 
 if TYPE_CHECKING:
     from ..core.evaluation.evaluate import Evaluation, Metric
+    from ..core.evaluation.parts import Part
 
 SUMMARY = "Measure an avatar on frames it has not seen, with the field's metrics."
 EXAMPLE = "pav eval out/avatar.pav out/collection --out out/eval --check --head-psnr 27"
@@ -48,6 +50,7 @@ def run(args: argparse.Namespace) -> int:
     from ..core.collection import read_collection
     from ..core.errors import InputError
     from ..core.evaluation.evaluate import by_appearance, evaluate, summary
+    from ..core.evaluation.parts import parts
     from ..core.evaluation.report import Claim, write_proof
     from ..core.evaluation.sheet import grid
     from ..core.field.avatar import Avatar
@@ -76,7 +79,11 @@ def run(args: argparse.Namespace) -> int:
     measured = list(dict.fromkeys(row["split"] for row in evaluation.rows))
     if args.head_psnr is not None and "test" not in measured:
         raise InputError(f"{args.collection}: no test frames that --head-psnr could be of")
-    for line in _table(evaluation, measured):
+    found = {
+        split: parts([row for row in evaluation.rows if row["split"] == split])
+        for split in measured
+    }
+    for line in [*_table(evaluation, measured), *_by_label(found)]:
         print(line)
     write_rgba(args.out / "sheet.png", grid(_sheet(evaluation)))
     fields = {
@@ -87,6 +94,7 @@ def run(args: argparse.Namespace) -> int:
         "absent": evaluation.absent,
         "needs": evaluation.needs,
         "left_out": evaluation.left_out,
+        "parts": {split: [asdict(part) for part in found[split]] for split in measured},
         "rows": evaluation.rows,
         "seconds": round(seconds, 1),
         "versions": versions(),
@@ -121,6 +129,21 @@ def _table(evaluation: Evaluation, splits: list[str]) -> list[str]:
         lines.append(f"{names[key]}: {reason} ({evaluation.needs[key]})")
     for name in evaluation.left_out:
         lines.append(f"{name}: left out, the avatar does not wear it")
+    return lines
+
+
+def _by_label(found: Mapping[str, Sequence[Part]]) -> list[str]:
+    """A Markdown table a split: where the person's pixels are, and their error."""
+    lines = []
+    for split, parts in found.items():
+        if parts:
+            lines += ["", f"| {split}, by label | of the person | of the error | PSNR, dB |"]
+            lines.append("|---|---|---|---|")
+        lines += [
+            f"| {p.name} | {p.area:.1%} | {p.error:.1%} | {p.psnr:.2f} |"
+            for p in parts
+            if p.area >= 0.001
+        ]
     return lines
 
 

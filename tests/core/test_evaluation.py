@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from pav_blender.cli import main
-from pav_blender.core.collection import Collection, read_collection
+from pav_blender.core.collection import LABELS, Collection, read_collection
 from pav_blender.core.errors import InputError
-from pav_blender.core.evaluation import learned
+from pav_blender.core.evaluation import learned, parts
 from pav_blender.core.evaluation.evaluate import (
     KEYS,
     METRICS,
@@ -24,7 +24,7 @@ from pav_blender.core.evaluation.evaluate import (
 )
 from pav_blender.core.evaluation.heldout import head_mask
 from pav_blender.core.evaluation.metrics import over, psnr, ssim
-from pav_blender.core.images import read_rgba
+from pav_blender.core.images import read_rgba, write_gray
 
 PLAIN = ("psnr", "head_psnr", "ssim")
 
@@ -57,6 +57,60 @@ def test_each_frame_has_a_row_of_what_its_picture_shows(toy, measured):
         assert 0 <= row["holes"] < 200
         assert row["appearance"] == score.appearance
     assert not measured.absent
+
+
+def test_the_error_is_told_by_label():
+    """Pixels and squared error of each label among the person's; the head is what no shoulder
+    wears, and shares are of the person."""
+    truth = np.zeros((4, 4, 3))
+    ours = truth.copy()
+    ours[0] = 0.1  # face
+    ours[1] = 0.5  # cloth
+    labels = np.zeros((4, 4), np.uint8)
+    labels[0], labels[1], labels[2] = (LABELS.index(n) for n in ("face", "cloth", "neck"))
+    person = labels > 0
+    person[0, 0] = False
+    found = parts.measured(ours, truth, person, labels)
+    assert found == {
+        "face": [3, pytest.approx(0.03)],
+        "neck": [4, 0.0],
+        "cloth": [4, pytest.approx(1.0)],
+    }
+    rows = [{"parts": found}, {"psnr": 1.0}, {"parts": {"face": [1, 0.97]}}]
+    face, neck, cloth, head = parts.parts(rows)
+    assert (face.name, face.area, face.error) == ("face", 4 / 12, pytest.approx(0.5))
+    assert face.psnr == pytest.approx(10 * np.log10(4 / 1.0))
+    assert (neck.psnr, neck.error) == (np.inf, 0.0)
+    assert (cloth.area, cloth.psnr) == (4 / 12, pytest.approx(10 * np.log10(4)))
+    assert (head.name, head.area, head.psnr) == (parts.HEAD, face.area, face.psnr)
+    assert parts.parts(rows[1:2]) == []
+
+
+def test_labels_of_a_collection_are_measured_and_wrong_ones_refused(
+    toy_path, toy_avatar_path, tmp_path
+):
+    copy = tmp_path / "labelled"
+    shutil.copytree(toy_path, copy)
+    toy = read_collection(copy)
+    labels = np.full((64, 64), LABELS.index("face"), np.uint8)
+    labels[40:] = LABELS.index("cloth")
+    for clip in toy.clips:
+        for row in clip.indices("test"):
+            write_gray(toy.labels_path(clip, int(row)), labels)
+    words = ["eval", toy_avatar_path, copy, "--per-appearance", 1, "--out"]
+    printed, _ = pav(*words, tmp_path / "out")
+    found = json.loads((tmp_path / "out" / "eval.json").read_text())
+    face, cloth, head = found["parts"]["test"]
+    assert [face["name"], cloth["name"], head["name"]] == ["face", "cloth", parts.HEAD]
+    assert face["area"] + cloth["area"] == pytest.approx(1)
+    whole = face["area"] * 10 ** (-face["psnr"] / 10) + cloth["area"] * 10 ** (-cloth["psnr"] / 10)
+    assert face["error"] == pytest.approx(face["area"] * 10 ** (-face["psnr"] / 10) / whole)
+    assert f"| {parts.HEAD} | {face['area']:.1%} |" in printed
+
+    path = toy.labels_path(toy.clips[0], int(toy.clips[0].indices("test")[0]))
+    write_gray(path, labels[:32])
+    _, said = pav(*words, tmp_path / "bad", code=2)
+    assert "not labels of a 64x64 picture" in said
 
 
 def test_means_are_over_appearances_means():

@@ -1,5 +1,6 @@
 """A collection of clips of one person, on disk and in memory."""
 
+from .labels import read_labels
 from .model import LABELS, SPLITS, Clip, Collection
 from .reader import read_collection
 from .relative import identity_distance, relative_clip
@@ -13,5 +14,6 @@ __all__ = [
     "CollectionWriter",
     "identity_distance",
     "read_collection",
+    "read_labels",
     "relative_clip",
 ]

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..collection import SPLITS, Clip, Collection
+from ..collection import SPLITS, Clip, Collection, read_labels
 from ..errors import InputError
 from ..field.avatar import Avatar
 from ..field.identities import own_appearances
@@ -18,8 +18,8 @@ from ..progress import Report
 from ..rendering.render import RenderSettings
 from ..rendering.sequence import check_head
 from ..training.frames import load_frames
-from . import learned
-from .heldout import BACKGROUND, Score, chosen_rows, score
+from . import learned, parts
+from .heldout import BACKGROUND, Score, chosen_rows, head_mask, score
 from .metrics import frechet, over
 
 
@@ -60,7 +60,8 @@ _COMPARED: dict[str, Callable[[Path | None], learned.Compare]] = {
 @dataclass
 class Evaluation:
     """rows: a dict a frame: frame ("clip/number"), appearance, split, and a value for each metric
-    that was there, FID excepted, and for `fog` and `holes`. absent: by key, why a metric was not
+    that was there, FID excepted, for `fog` and `holes`, and where there are labels `parts` (see
+    `parts.measured`). absent: by key, why a metric was not
     (`learned.Absent`); needs: by key, what to bring. scores: frames with their pictures, as many as
     were asked for. left_out: appearances of the collection that the avatar does not have. features:
     what FID compares, ([N, D] ours, [N, D] true), a row each of `rows`.
@@ -129,6 +130,9 @@ def evaluate(
         values = {k: getattr(scored, k) for k in ("psnr", "head_psnr", "ssim") if k in metrics}
         values |= {key: compare(ours, truth) for key, compare in compared.items()}
         values |= {"fog": 1e3 * scored.fog, "holes": 1e3 * scored.holes}
+        labels = read_labels(collection, clip, row)
+        if labels is not None:
+            values["parts"] = parts.measured(ours, truth, head_mask(frame.rgba), labels)
         result.rows.append(
             {"frame": frame.name, "appearance": clip.appearance, "split": split, **values}
         )

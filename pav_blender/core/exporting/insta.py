@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from ..collection import LABELS, Clip, Collection
+from ..collection import LABELS, Clip, Collection, read_labels
 from ..collection.importers.labels import INSTA_CODES
 from ..deformation.rigid import head_rotation
 from ..errors import InputError
 from ..files import new_folder, write_text
-from ..images import read_gray, write_gray, write_rgba
+from ..images import write_gray, write_rgba
 from ..progress import Report
 from ..rendering.rasterise import rasterise
 from ..training.frames import camera_of, load_picture
@@ -152,11 +152,8 @@ def _parts(
 ) -> np.ndarray:
     """INSTA's codes [H, W] uint8: of the labels, or where there are none of the mesh's regions;
     what stands off the mesh is hair then."""
-    path = collection.labels_path(clip, row)
-    if path.is_file():
-        labels = read_gray(path)
-        if labels.shape != alpha.shape or labels.max() >= len(INSTA_CODES):
-            raise InputError(f"{path}: not labels of a {clip.width}x{clip.height} picture")
+    labels = read_labels(collection, clip, row)
+    if labels is not None:
         return INSTA_CODES[labels]
     code = dict(zip(LABELS, INSTA_CODES, strict=True))
     codes = np.full(collection.head.vertex_count, code["face"], np.uint8)
