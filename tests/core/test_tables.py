@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 import shutil
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from pav_blender.core.evaluation.methods import CHOICES, METHODS, method
 from pav_blender.core.evaluation.paper_tables import TABLES
 from pav_blender.core.evaluation.study import Result, Study, result
 from pav_blender.core.evaluation.tables import Cell, Column, Table, latex, markdown
+from pav_blender.core.training import trainer
 from pav_blender.core.training.prepare import load_training_frames, new_avatar
 from pav_blender.core.training.trainer import Trainer
 
@@ -148,7 +150,8 @@ def quick(monkeypatch):
     return {m.key: m for m in shrunk}
 
 
-def test_what_is_there_is_not_made_again(toy, quick, tmp_path):
+def test_what_is_there_is_not_made_again(toy, quick, tmp_path, monkeypatch):
+    monkeypatch.setattr(trainer, "time", SimpleNamespace(monotonic=lambda: 0.0))
     study = Study(toy, tmp_path, iterations=3, per_appearance=1)
     first = result(study, quick["insta_clips"], 0)
     files = sorted(tmp_path.glob("*.pav"))
@@ -160,7 +163,7 @@ def test_what_is_there_is_not_made_again(toy, quick, tmp_path):
     again = result(study, quick["insta_clips"], 0)
     assert again == first or vars(again) == vars(first)
     assert [f.stat().st_mtime_ns for f in files] == times
-    # trained anew where the settings are others, and measured anew then
+    # trained anew where the settings are others, and measured anew then, however long it took
     longer = result(dataclasses.replace(study, iterations=4), quick["insta_clips"], 0)
     assert all(f.stat().st_mtime_ns != t for f, t in zip(files, times, strict=True))
     assert longer.measures != first.measures

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -75,10 +76,9 @@ def result(
     that an interrupted study goes on where it was. Raises Cancelled, InputError."""
     paths = _train(study, method, seed, progress, should_stop)
     known = study.out / f"{method.key}-{seed}.json"
-    # seconds tell trainings apart that are equal otherwise
     trained = [read_header(path)["record"] for path in paths]
     source = {
-        "trained": [[record["collection"], record["seconds"]] for record in trained],
+        "trained": [_digest(path) for path in paths],
         "novel": fingerprint(study.novel) if study.novel else None,
         "per_appearance": study.per_appearance,
     }
@@ -114,6 +114,11 @@ def result(
         {name: stored["sets"][name]["summary"] | words for name in study.sets},
         stored["examples"],
     )
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def example_path(study: Study, method: Method, seed: int, appearance: str) -> Path:
