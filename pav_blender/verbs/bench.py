@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
         landmark_model=args.landmark_model,
     )
     module = importlib.import_module(f"...benchmarks.{args.name}", __name__)
-    fields, claims = module.run(options, Progress("train", as_json=args.json_progress))
+    fields, claims = module.run(options, Progress(args.name, as_json=args.json_progress))
     fields |= {"versions": versions(), "machine": machine()}
     path = args.out / f"{args.name}.json"
     met = write_proof(path, fields, claims)
