@@ -3,6 +3,7 @@ in a file is ever run. What is damaged raises InputError, one line that names th
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import stat
@@ -54,6 +55,12 @@ def read_bytes(path: Path | str, largest: int = _LARGEST) -> bytes:
         return Path(path).read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+
+
+def digest(path: Path | str) -> str:
+    """The SHA-256 of a file's contents, hex."""
+    with open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def read_json(path: Path | str, largest: int = LARGEST_JSON) -> dict[str, Any]:

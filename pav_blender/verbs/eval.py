@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
     from ..core.collection import read_collection
     from ..core.errors import InputError
     from ..core.evaluation.evaluate import by_appearance, evaluate, summary
-    from ..core.evaluation.parts import parts
+    from ..core.evaluation.parts import shares
     from ..core.evaluation.report import Claim, write_proof
     from ..core.evaluation.sheet import grid
     from ..core.field.avatar import Avatar
@@ -80,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
     if args.head_psnr is not None and "test" not in measured:
         raise InputError(f"{args.collection}: no test frames that --head-psnr could be of")
     found = {
-        split: parts([row for row in evaluation.rows if row["split"] == split])
+        split: shares([row for row in evaluation.rows if row["split"] == split])
         for split in measured
     }
     for line in [*_table(evaluation, measured), *_by_label(found)]:

@@ -23,7 +23,7 @@ from pav_blender.core.evaluation.evaluate import (
     summary,
 )
 from pav_blender.core.evaluation.heldout import head_mask
-from pav_blender.core.evaluation.metrics import over, psnr, ssim
+from pav_blender.core.evaluation.metrics import LARGEST_PSNR, over, psnr, ssim
 from pav_blender.core.images import read_rgba, write_gray
 
 PLAIN = ("psnr", "head_psnr", "ssim")
@@ -77,13 +77,13 @@ def test_the_error_is_told_by_label():
         "cloth": [4, pytest.approx(1.0)],
     }
     rows = [{"parts": found}, {"psnr": 1.0}, {"parts": {"face": [1, 0.97]}}]
-    face, neck, cloth, head = parts.parts(rows)
+    face, neck, cloth, head = parts.shares(rows)
     assert (face.name, face.area, face.error) == ("face", 4 / 12, pytest.approx(0.5))
     assert face.psnr == pytest.approx(10 * np.log10(4 / 1.0))
-    assert (neck.psnr, neck.error) == (np.inf, 0.0)
+    assert (neck.psnr, neck.error) == (LARGEST_PSNR, 0.0)
     assert (cloth.area, cloth.psnr) == (4 / 12, pytest.approx(10 * np.log10(4)))
     assert (head.name, head.area, head.psnr) == (parts.HEAD, face.area, face.psnr)
-    assert parts.parts(rows[1:2]) == []
+    assert parts.shares(rows[1:2]) == []
 
 
 def test_labels_of_a_collection_are_measured_and_wrong_ones_refused(

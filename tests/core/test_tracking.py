@@ -201,20 +201,20 @@ def test_quiet_keeps_native_chatter_and_gives_the_stream_back(capfd):
 
 def test_threads_that_are_quiet_at_once_give_the_stream_back(capfd):
     """Each alone would keep what the other silenced, or silence what the other gave back."""
-    entered, left = threading.Barrier(2), threading.Event()
+    entered, both = threading.Event(), threading.Event()
 
     def first():
         with quiet():
-            entered.wait(10)
-        left.set()
+            entered.set()
+            both.wait(10)
 
     thread = threading.Thread(target=first)
     thread.start()
+    assert entered.wait(10)
     with quiet():
-        entered.wait(10)
-        assert left.wait(10)
+        both.set()
+        thread.join(10)
         os.write(2, b"chatter")
-    thread.join()
     os.write(2, b"kept")
     assert capfd.readouterr().err == "kept"
 

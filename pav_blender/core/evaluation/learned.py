@@ -8,7 +8,6 @@ missing is said and never fetched, nor is another network taken in its place.
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import importlib
 import importlib.util
 import sys
@@ -23,7 +22,7 @@ import numpy as np
 import torch
 
 from ..errors import InputError
-from ..reading import first_line
+from ..reading import digest, first_line
 
 Compare = Callable[[np.ndarray, np.ndarray], float]  # pictures [H, W, 3] in [0, 1]
 Features = Callable[[np.ndarray], np.ndarray]  # a picture -> [D]
@@ -174,8 +173,7 @@ def find(file: WeightsFile, folder: Path | None) -> Path:
 
 def read(file: WeightsFile, path: Path) -> dict[str, torch.Tensor]:
     """The state in a published file. InputError where its checksum is not the file's own."""
-    with open(path, "rb") as stream:
-        found = hashlib.file_digest(stream, "sha256").hexdigest()
+    found = digest(path)
     if not found.startswith(file.digest):
         raise InputError(
             f"{path}: damaged or another file: its SHA-256 starts with {found[:8]}, not "

@@ -22,7 +22,12 @@ def psnr(picture: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None)
         error = error[mask]
     if error.size == 0:
         return math.nan
-    return min(LARGEST_PSNR, -10 * math.log10(max(float(error.mean()), 1e-12)))
+    return decibels(float(error.mean()))
+
+
+def decibels(error: float) -> float:
+    """The PSNR of a mean squared error, of colours in [0, 1]; at most LARGEST_PSNR."""
+    return min(LARGEST_PSNR, -10 * math.log10(max(error, 1e-12)))
 
 
 def ssim(picture: np.ndarray, truth: np.ndarray) -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..collection import LABELS
+from .metrics import decibels
 
 # worn by the shoulders, or hidden by what they wear
 NOT_HEAD = ("background", "neck", "cloth")
@@ -43,11 +43,11 @@ def measured(
     }
 
 
-def parts(rows: Sequence[Mapping[str, Any]]) -> list[Part]:
+def shares(rows: Sequence[Mapping[str, Any]]) -> list[Part]:
     """Of frames' rows that have `parts` (see `measured`): each label that is seen, then the head
     without what shoulders wear. Empty where no row has them."""
     found = [row["parts"] for row in rows if "parts" in row]
-    seen = [name for name in LABELS if any(name in parts for parts in found)]
+    seen = [name for name in LABELS if any(name in frame for frame in found)]
     if not seen:
         return []
     total = _summed(found, seen)
@@ -60,11 +60,11 @@ def _summed(
     found: Iterable[Mapping[str, Sequence[float]]], names: Iterable[str]
 ) -> tuple[float, float]:
     names = set(names)
-    pairs = [parts[name] for parts in found for name in parts if name in names]
+    pairs = [frame[name] for frame in found for name in frame if name in names]
     return sum(pair[0] for pair in pairs), sum(pair[1] for pair in pairs)
 
 
 def _part(name: str, own: tuple[float, float], total: tuple[float, float]) -> Part:
     pixels, error = own
-    psnr = 10 * math.log10(pixels / error) if error else math.inf
-    return Part(name, pixels / total[0], error / total[1] if total[1] else 0.0, psnr)
+    share = error / total[1] if total[1] else 0.0
+    return Part(name, pixels / total[0], share, decibels(error / pixels))

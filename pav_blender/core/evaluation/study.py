@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -15,7 +14,7 @@ from ..field.avatar import Avatar, read_header
 from ..files import write_text
 from ..images import write_rgba
 from ..progress import Report
-from ..reading import read_json
+from ..reading import digest, read_json
 from ..training.people import People, read_people
 from ..training.places import checkpoint_path
 from ..training.train import fingerprint, train
@@ -78,7 +77,7 @@ def result(
     known = study.out / f"{method.key}-{seed}.json"
     trained = [read_header(path)["record"] for path in paths]
     source = {
-        "trained": [_digest(path) for path in paths],
+        "trained": [digest(path) for path in paths],
         "novel": fingerprint(study.novel) if study.novel else None,
         "per_appearance": study.per_appearance,
     }
@@ -114,11 +113,6 @@ def result(
         {name: stored["sets"][name]["summary"] | words for name in study.sets},
         stored["examples"],
     )
-
-
-def _digest(path: Path) -> str:
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def example_path(study: Study, method: Method, seed: int, appearance: str) -> Path:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import hashlib
 import importlib
 import os
 import threading
@@ -16,7 +15,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..head import builtin_head
-from ..reading import MIB, read_bytes, stored_members
+from ..reading import MIB, digest, read_bytes, stored_members
 
 INSTALL = "`pip install mediapipe==0.10.21` (Python 3.9 to 3.12)"
 _LARGEST_TASK = 256 * MIB
@@ -135,9 +134,7 @@ def detector_name(task_file: Path | str | None) -> str:
     version = getattr(load_mediapipe(), "__version__", "unknown")
     if task_file is None or not Path(task_file).is_file():
         return f"both ways, mediapipe {version}"
-    return (
-        f"both ways, mediapipe {version} {hashlib.sha256(Path(task_file).read_bytes()).hexdigest()}"
-    )
+    return f"both ways, mediapipe {version} {digest(task_file)}"
 
 
 class _Hands:

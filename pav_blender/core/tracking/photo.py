@@ -114,7 +114,8 @@ def _any(head: HeadModel, names: tuple[str, ...]) -> np.ndarray:
 def sample(
     pictures: Pictures, pixels: np.ndarray, rows: slice = slice(None)
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Features at pixels [f,L,2]: values [f,L], gradient a source pixel [f,L,2], inside [f,L]."""
+    """Features at pixels [f,L,2]: values [f,L], gradient a source pixel [f,L,2], inside [f,L].
+    Outside the window values are those of its nearest place, and the gradient is 0."""
     scale = pictures.scale[rows]
     at = (pixels - pictures.corners[rows][:, None]) * scale[:, None, None] - 0.5
     features, at = pictures.features[rows], np.ascontiguousarray(at)

@@ -211,8 +211,8 @@ class Photo:
         assert self.template is not None
         posed = _posed(self.model, betas, fit, rows)
         pixels = project(posed.points, fit.focal)
-        values, gradient, inside = sample(self.pictures, pixels, rows)
-        root = np.sqrt(self.weights[rows] * inside)
+        values, gradient, _ = sample(self.pictures, pixels, rows)
+        root = np.sqrt(self.weights[rows])
         gradient = gradient * root[..., None]
         outer = gradient[..., None, :] @ project_slopes(posed.points, fit.focal)
         by_focal = (gradient * pixels).sum(axis=2, keepdims=True)

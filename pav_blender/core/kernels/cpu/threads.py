@@ -52,9 +52,10 @@ def _executor(size: int) -> ThreadPoolExecutor:
 
 
 def _forget_pool() -> None:
-    """A forked child has no worker threads: it must start its own."""
-    global _pool, _pool_size
-    _pool, _pool_size = None, 0
+    """A forked child has no worker threads: it must start its own. Nor can it wait for a lock that
+    a thread held which it does not have."""
+    global _pool, _pool_size, _first
+    _pool, _pool_size, _first = None, 0, threading.RLock()
 
 
 if hasattr(os, "register_at_fork"):
