@@ -219,6 +219,20 @@ def test_space_is_emptied_while_learning(toy, frames, toy_avatar, small_config):
     assert 0.3 * before < toy_avatar.occupied.mean() < 0.97 * before
 
 
+def test_a_longer_training_empties_space_no_oftener(toy, frames, small_config):
+    """Each emptying may take cells that only poses not drawn of late show."""
+    times = []
+    for iterations in (2_000, 4_000, 40_000):
+        config = dataclasses.replace(small_config, iterations=iterations)
+        status = (trainer := Trainer(new_avatar(toy, frames, config), frames)).status
+        count = 0
+        for status.iteration in range(1, iterations + 1):
+            if trainer._prunes_now():
+                count, status.pruned = count + 1, status.iteration
+        times.append(count)
+    assert 15 < times[0] <= times[1] == times[2] < 40
+
+
 def test_the_same_seed_gives_the_same_weights(toy, small_config, tmp_path):
     config = dataclasses.replace(small_config, iterations=6)
     states = []

@@ -131,7 +131,11 @@ def put(target: torch.Tensor, stored: torch.Tensor) -> None:
 
 def _check_status(status: Status, config: Config) -> None:
     """ValueError, or TypeError, where training cannot have stood there."""
-    counts = (status.iteration, range(1 << 62)), (status.rays, range(1, config.rays + 1))
+    counts = (
+        (status.iteration, range(1 << 62)),
+        (status.rays, range(1, config.rays + 1)),
+        (status.pruned, range(status.iteration + 1)),
+    )
     if any(type(number) is not int or number not in known for number, known in counts):
         raise ValueError("counts")
     amounts = status.seconds, status.samples_per_ray, status.filled

@@ -30,15 +30,18 @@ _FIRST_STEP = 8.0  # the first samples are this many times as far apart as the l
 _LOOKS_A_RAY = 40  # the step is as fine as this many looks a ray allow
 _SAMPLES = 1 << 14  # samples a batch, by the number of its rays
 _MANY_SAMPLES = 1 << 18  # the same off the CPU, where few take as long as many
-_CARVED = 0.5  # part of the schedule in which space is emptied often
-_PRUNE_EVERY = 50  # iterations, while there is much to empty
-_PRUNE_LATER = 200
+# Space is emptied at parts of the schedule, not at iterations: each time a few cells go that only
+# poses not drawn of late show, so a training ten times as long would have ten times the holes.
+_PRUNE_FROM = 0.15
+_PRUNE_EVERY = 1 / 60
+_CARVED = 0.5  # part of the schedule after which there is less to empty
+_PRUNE_LATER = 1 / 15
+_LEAST_BATCHES = 50  # iterations between two times
 _WARM_UP = 20
 # parts of the schedule until which pictures are a half and a quarter as large: there are more
 # pixels than an avatar's minutes have rays, and small ones tell the most each
 _COARSE = (0.4, 0.15)
 _ENDED = 0.01  # transmittance at which a ray may be ended
-_PRUNE_FROM = 0.15
 _RENEWED = 1 / 16  # chance that a frame drawn is one that was not in use
 _SMALL_ERROR = 1e-3  # mean squared error of a batch that is never a spike: 30 dB
 
@@ -46,7 +49,8 @@ _SMALL_ERROR = 1e-3  # mean squared error of a batch that is never a spike: 30 d
 @dataclass
 class Status:
     """Where training stands: smoothed loss and PSNR of the batches, samples a ray, part of the
-    space that is left, and the next batch's step (metres) and rays."""
+    space that is left, the next batch's step (metres) and rays, and the iteration after which
+    space was last emptied."""
 
     iteration: int = 0
     seconds: float = 0.0
@@ -56,6 +60,7 @@ class Status:
     filled: float = 1.0
     step: float = 1e-3
     rays: int = 1
+    pruned: int = 0
 
 
 class Refines(Protocol):
@@ -164,6 +169,7 @@ class Trainer:
         status.iteration += 1
         if self._prunes_now():
             status.filled = self.visibility.prune()
+            status.pruned = status.iteration
         if takes:
             self._note(loss, len(picked.t) / max(count, 1))
         self._plan(picked.looks / max(count, 1))
@@ -255,9 +261,11 @@ class Trainer:
         status.rays = int(min(max(rays, config.rays / 8), config.rays))
 
     def _prunes_now(self) -> bool:
-        often = self.done < _CARVED
-        every = _PRUNE_EVERY if often else _PRUNE_LATER
-        return self.done > _PRUNE_FROM and self.status.iteration % every == 0
+        done, iteration = self.done, self.status.iteration
+        since = iteration - self.status.pruned
+        if done <= _PRUNE_FROM or since < _LEAST_BATCHES:
+            return False
+        return since >= round((_PRUNE_EVERY if done < _CARVED else _PRUNE_LATER) * iteration / done)
 
     def _adam(self, samples: Samples, encoded: torch.Tensor) -> None:
         config, field = self.config, self.avatar.field
