@@ -316,5 +316,5 @@ def world(head: HeadModel, betas: np.ndarray, fit: ClipFit) -> tuple[ClipFit, np
     camera[:3, :3] = turn.T @ np.diag([1.0, -1.0, -1.0])
     camera[:3, 3] = joint - turn.T @ (joint + middle)
     pose = fit.pose.copy()
-    pose[:, 0] = 0
+    pose[:, 0] = axis_angles(turn.T @ rotations(pose[:, 0]))
     return replace(fit, root=np.zeros(3), pose=pose, translation=translation), camera

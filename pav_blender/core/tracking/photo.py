@@ -62,7 +62,7 @@ def windows(
     corners = np.round((low + high) / 2 - side / 2)
     whole = round(side)
     for row, rgb in enumerate(frames):
-        features[row] = _feature(_cut(rgb, corners[row].astype(int), whole))
+        features[row] = feature(_cut(rgb, corners[row].astype(int), whole))
     middle = np.array([width / 2, height / 2])
     return Pictures(features, corners - middle, np.full(count, SIDE / whole))
 
@@ -77,7 +77,8 @@ def _cut(rgb: np.ndarray, corner: np.ndarray, side: int) -> np.ndarray:
     return resize(grey[..., None], SIDE)[..., 0]
 
 
-def _feature(grey: np.ndarray) -> np.ndarray:
+def feature(grey: np.ndarray) -> np.ndarray:
+    """What is compared, int8 [H, W], of luminance float32 [H, W] in [0, 1]."""
     smooth = gaussian_filter(grey, 1.0)
     mean = uniform_filter(uniform_filter(smooth, _LOCAL), _LOCAL)
     off = smooth - mean

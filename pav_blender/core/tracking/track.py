@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +13,9 @@ from ..collection import CollectionWriter
 from ..errors import InputError
 from ..head import BUILTIN, HeadModel, remember_head
 from ..head.flame import version_of
-from ..kernels.cpu.threads import torch_alone
+from ..kernels.cpu.threads import each, torch_alone
 from ..progress import Report
-from . import detectors
+from . import detectors, shoulders
 from .cache import Cache
 from .fit import USUAL_RATE, HeadFit, fit_head, refine_head
 from .looking import Shot, Take, choose_shots, sight
@@ -162,9 +162,10 @@ def fit_shots(
     )
     if not photo:
         return [fit]
-    pictures = []
+    pictures, greys = [], []
     for shot in shots:
-        frames = (rgb for _, rgb in frames_of(shot, np.arange(len(shot.seen)), should_stop))
+        greys.append(np.empty((len(shot.seen), shoulders.SIDE, shoulders.SIDE), np.uint8))
+        frames = _keeping(shot, greys[-1], should_stop)
         pictures.append(
             face_windows(frames, shot.seen.landmarks, shot.seen.width, shot.seen.height)
         )
@@ -177,7 +178,34 @@ def fit_shots(
         progress=lambda done: tell(share + (1 - share) * done, step="following the skin"),
         should_stop=should_stop,
     )
-    return [fit, refined]
+    return [fit, _with_shoulders(head, shots, refined, greys, should_stop)]
+
+
+def _keeping(shot: Shot, greys: np.ndarray, should_stop: ShouldStop | None) -> Iterator[np.ndarray]:
+    """A shot's frames; of each the window that is written is put into `greys`."""
+    for row, rgb in frames_of(shot, np.arange(len(shot.seen)), should_stop):
+        greys[row] = shoulders.grey_window(rgb, shot.crop.corners[row], shot.crop.side)
+        yield rgb
+
+
+def _with_shoulders(
+    head: HeadModel,
+    shots: Sequence[Shot],
+    fit: HeadFit,
+    greys: list[np.ndarray],
+    should_stop: ShouldStop | None,
+) -> HeadFit:
+    clips = list(fit.clips)
+
+    def follow(index: int) -> None:
+        crop, seen = shots[index].crop, shots[index].seen
+        corners = crop.corners - np.array([seen.width, seen.height]) / 2
+        clips[index] = shoulders.follow(
+            head, fit.betas, clips[index], greys[index], corners, crop.side, should_stop
+        )
+
+    each(follow, len(clips))
+    return replace(fit, clips=clips)
 
 
 def _silent(fraction: float, **fields: object) -> None:

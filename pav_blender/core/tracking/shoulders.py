@@ -1,0 +1,198 @@
+"""How the shoulders stand in each frame, told by what they wear.
+
+Landmarks are of the face alone, so the fit keeps a clip's shoulders turned one way and hangs them
+on the head. People sway and lean: here each frame's shoulders turn about the neck's joint until
+cloth, collar and outline lie where the clip shows them on the whole. The head stays where it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from ..errors import Cancelled
+from ..head import HeadModel
+from ..head.geometry import vertex_normals
+from .crop import resize
+from .landmark_model import axis_angles, cross_matrices, rotations
+from .photo import Pictures, feature, sample, templates
+from .terms import ClipFit, project, project_slopes
+
+SIDE = 224  # of a window with the shoulders in it, pixels
+_LEVELS = ((4, 12), (2, 6), (1, 6))  # pixels taken together, and steps at that size
+_POINTS, _TRIED = 600, 6_000
+# Skinning weight of the root from which a point is followed. Meshes blend collars with the neck;
+# what is worn there rests on the shoulders all the same, and is often all that a picture shows.
+_TORSO = 0.4
+_SPREAD = 0.1  # radians that shoulders turn from how a clip shows them on the whole
+_INDEPENDENT = 0.05  # of residuals: neighbouring points tell nearly the same
+_FLOOR = 0.05
+_LONGEST = 0.05  # radians a step
+_FEWEST = 60  # points in the picture
+_SHARP = 2  # how sharply points that go with the head are told from those that do not
+
+
+def grey_window(rgb: np.ndarray, corner: np.ndarray, side: int) -> np.ndarray:
+    """Luminance uint8 [SIDE, SIDE] of a square window of a frame uint8 [H, W, 3]."""
+    left, top = (int(value) for value in corner)
+    window = rgb[top : top + side, left : left + side].astype(np.float32)
+    grey = window @ np.array([0.299, 0.587, 0.114], np.float32)
+    return (resize(grey[..., None], SIDE)[..., 0].clip(0, 255) + 0.5).astype(np.uint8)
+
+
+def follow(
+    head: HeadModel,
+    betas: np.ndarray,
+    fit: ClipFit,
+    greys: np.ndarray,
+    corners: np.ndarray,
+    side: int,
+    should_stop: Callable[[], bool] | None = None,
+) -> ClipFit:
+    """The fit with each frame's shoulders where its picture shows them.
+
+    greys uint8 [F, SIDE, SIDE]: windows of `side` source pixels whose left upper corners [F, 2]
+    count from the picture's middle. A head without a neck, or pictures that show too little of
+    the shoulders, give the fit back as it is. Raises Cancelled.
+    """
+    if "neck" not in head.joint_names or len(greys) < 2:
+        return fit
+    joints = head.joints(betas).astype(np.float64)
+    pivot = joints[head.joint_names.index("neck")]
+    start = rotations(fit.pose[:, 0])
+    # the neck's joint is where the head has it
+    held = np.einsum("fij,j->fi", start, pivot - joints[0]) + joints[0] + fit.translation
+    points, normals = torso_points(head, betas)
+    shown = _shown(points, start, held - start @ pivot, fit.focal, corners, side)
+    arms, normals = points[shown] - pivot, normals[shown]
+    neck = head.joint_names.index("neck")
+    nodding = start @ rotations(fit.pose[:, neck])
+    turns = start
+    for level, steps in _LEVELS:
+        pictures = _pictures(greys, corners, side, level)
+        with_head = _look(nodding, held, arms, normals, fit.focal, pictures)
+        for _ in range(steps):
+            if should_stop is not None and should_stop():
+                raise Cancelled("tracking stopped; the same command goes on from here")
+            turns, moved = _step(
+                turns, start, held, arms, normals, fit.focal, pictures, with_head.stray
+            )
+            if moved < 1e-4:
+                break
+    pose = fit.pose.copy()
+    pose[:, 0] = axis_angles(turns)
+    pose[:, neck] = axis_angles(turns.transpose(0, 2, 1) @ start @ rotations(fit.pose[:, neck]))
+    translation = held - joints[0] - np.einsum("fij,j->fi", turns, pivot - joints[0])
+    return replace(fit, pose=pose, translation=translation)
+
+
+def torso_points(head: HeadModel, betas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points [L, 3] spread by area over what turns with the root and faces forward, in random
+    order, and their directions [L, 3]; always the same ones."""
+    vertices = head.shaped(betas).astype(np.float64)
+    torso = (head.skinning_weights[:, 0] >= _TORSO)[head.triangles].all(axis=1)
+    a, b, c = (vertices[head.triangles[:, i]] for i in range(3))
+    normal = np.cross(b - a, c - a)
+    share = np.where(torso & (normal[:, 2] > 0), np.linalg.norm(normal, axis=1), 0.0)
+    if not share.any():
+        return np.zeros((0, 3)), np.zeros((0, 3))
+    rng = np.random.default_rng(0)
+    triangles = rng.choice(len(share), _TRIED, p=share / share.sum())
+    u, v = np.sqrt(rng.random(_TRIED)), rng.random(_TRIED)
+    mix = np.stack([1 - u, u * (1 - v), u * v], axis=1)
+    corners = head.triangles[triangles]
+    directions = vertex_normals(vertices, head.triangles)[corners]
+    spread = [np.einsum("lv,lvx->lx", mix, values) for values in (vertices[corners], directions)]
+    normals = spread[1] / np.linalg.norm(spread[1], axis=1, keepdims=True).clip(1e-12)
+    return spread[0], normals
+
+
+def _shown(
+    points: np.ndarray,
+    turns: np.ndarray,
+    places: np.ndarray,
+    focal: float,
+    corners: np.ndarray,
+    side: int,
+) -> np.ndarray:
+    """The first points [n] that most frames have in their window."""
+    few = slice(None, None, -(-len(turns) // 16))
+    posed = np.einsum("fij,lj->fli", turns[few], points) + places[few, None]
+    within = project(posed, focal) - corners[few, None]
+    inside = ((within > 0) & (within < side)).all(axis=2).mean(axis=0) > 0.5
+    return np.flatnonzero(inside)[:_POINTS]
+
+
+def _pictures(greys: np.ndarray, corners: np.ndarray, side: int, level: int) -> Pictures:
+    size = SIDE // level
+    small = greys.reshape(len(greys), size, level, size, level).mean(axis=(2, 4), dtype=np.float32)
+    features = np.stack([feature(grey / 255) for grey in small])
+    return Pictures(features, corners.astype(np.float64), np.full(len(greys), size / side))
+
+
+class _Look(NamedTuple):
+    """Points [F, L, 3] about the neck's joint; what they show more than they usually do, and its
+    gradient a source pixel [F, L, 2]; base [F, L]: 1 where they can be seen; stray [L]: how far
+    from its usual look a point mostly is."""
+
+    spun: np.ndarray
+    places: np.ndarray
+    residual: np.ndarray
+    gradient: np.ndarray
+    base: np.ndarray
+    stray: np.ndarray
+
+
+def _look(
+    turns: np.ndarray,
+    held: np.ndarray,
+    arms: np.ndarray,
+    normals: np.ndarray,
+    focal: float,
+    pictures: Pictures,
+) -> _Look:
+    spun = np.einsum("fij,lj->fli", turns, arms)
+    places = spun + held[:, None]
+    values, gradient, inside = sample(pictures, project(places, focal))
+    facing = -np.einsum("fli,fli->fl", np.einsum("fij,lj->fli", turns, normals), places)
+    base = (inside & (facing > 0)).astype(np.float64)
+    template, _ = templates(values, base)
+    residual = values - template
+    robust = np.minimum(np.abs(residual), 0.5) * base
+    stray = robust.sum(axis=0) / base.sum(axis=0).clip(1) + 1e-3
+    return _Look(spun, places, residual, gradient, base, stray)
+
+
+def _step(
+    turns: np.ndarray,
+    start: np.ndarray,
+    held: np.ndarray,
+    arms: np.ndarray,
+    normals: np.ndarray,
+    focal: float,
+    pictures: Pictures,
+    stray_with_head: np.ndarray,
+) -> tuple[np.ndarray, float]:
+    """Turns [F, 3, 3] after one Gauss-Newton step, and the longest of its turns, radians."""
+    look = _look(turns, held, arms, normals, focal, pictures)
+    known = look.base.sum(axis=1) >= _FEWEST
+    if not known.any():
+        return turns, 0.0
+    usual = max(_FLOOR, 1.48 * float(np.median(np.abs(look.residual[look.base > 0]))))
+    robust = 1 / (1 + look.residual**2 / (4 * usual**2)) ** 2
+    # hair that hangs over the shoulders turns with the head: what looks the same there is left out
+    own = stray_with_head**_SHARP / (stray_with_head**_SHARP + look.stray**_SHARP)
+    weights = _INDEPENDENT * look.base * robust * own / usual**2
+    # d point / d turn = - [spun]x
+    slopes = np.einsum("flp,flpi->fli", look.gradient, project_slopes(look.places, focal))
+    slopes = -np.einsum("fli,flij->flj", slopes, cross_matrices(look.spun))
+    matrix = np.einsum("fl,fli,flj->fij", weights, slopes, slopes) + np.eye(3) / _SPREAD**2
+    away = axis_angles(turns @ start.transpose(0, 2, 1))
+    right = np.einsum("fl,fli,fl->fi", weights, slopes, look.residual) + away / _SPREAD**2
+    change = -np.linalg.solve(matrix, right[..., None])[..., 0] * known[:, None]
+    length = np.linalg.norm(change, axis=1, keepdims=True)
+    change *= np.minimum(1.0, _LONGEST / length.clip(1e-12))
+    return rotations(change) @ turns, float(np.abs(change).max())
