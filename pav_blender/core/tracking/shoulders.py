@@ -28,11 +28,11 @@ _POINTS, _TRIED = 600, 6_000
 # what is worn there rests on the shoulders all the same, and is often all that a picture shows.
 _TORSO = 0.4
 _SPREAD = 0.1  # radians that shoulders turn from how a clip shows them on the whole
-_INDEPENDENT = 0.05  # of residuals: neighbouring points tell nearly the same
+_INDEPENDENT = 0.02  # of residuals: neighbouring points tell nearly the same
 _FLOOR = 0.05
 _LONGEST = 0.05  # radians a step
 _FEWEST = 60  # points in the picture
-_SHARP = 2  # how sharply points that go with the head are told from those that do not
+_SHARP = 6  # how sharply points that go with the head are told from those that do not
 
 
 def grey_window(rgb: np.ndarray, corner: np.ndarray, side: int) -> np.ndarray:
