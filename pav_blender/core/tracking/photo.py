@@ -97,11 +97,17 @@ def face_points(head: HeadModel, shapes: int) -> PointModel:
     region = region & ~_any(head, ("eyeballs", "eye_sockets", "mouth_interior", "tongue", "teeth"))
     skin = region[head.triangles].all(axis=1)
     share = np.where(skin & (normal[:, 2] > -0.2 * area), area, 0.0)
+    return PointModel(head, shapes, *scattered(share, _POINTS))
+
+
+def scattered(share: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Triangles [count], drawn by their share, and random barycentrics in them [count, 3]; the
+    same ones every time."""
     rng = np.random.default_rng(0)
-    triangles = rng.choice(len(share), _POINTS, p=share / share.sum())
-    u = np.sqrt(rng.random(_POINTS))
-    v = rng.random(_POINTS)
-    return PointModel(head, shapes, triangles, np.stack([1 - u, u * (1 - v), u * v], axis=1))
+    triangles = rng.choice(len(share), count, p=share / share.sum())
+    u = np.sqrt(rng.random(count))
+    v = rng.random(count)
+    return triangles, np.stack([1 - u, u * (1 - v), u * v], axis=1)
 
 
 def _any(head: HeadModel, names: tuple[str, ...]) -> np.ndarray:

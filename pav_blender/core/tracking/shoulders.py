@@ -17,8 +17,8 @@ from ..errors import Cancelled
 from ..head import HeadModel
 from ..head.geometry import vertex_normals
 from .crop import resize
-from .landmark_model import axis_angles, cross_matrices, rotations
-from .photo import Pictures, feature, sample, templates
+from .landmark_model import axis_angles, rotations
+from .photo import Pictures, feature, sample, scattered, templates
 from .terms import ClipFit, project, project_slopes
 
 SIDE = 224  # of a window with the shoulders in it, pixels
@@ -55,20 +55,20 @@ def follow(
     """The fit with each frame's shoulders where its picture shows them.
 
     greys uint8 [F, SIDE, SIDE]: windows of `side` source pixels whose left upper corners [F, 2]
-    count from the picture's middle. A head without a neck, or pictures that show too little of
-    the shoulders, give the fit back as it is. Raises Cancelled.
+    count from the picture's middle. A head whose neck does not stand on its root, or pictures that
+    show too little of the shoulders, give the fit back as it is. Raises Cancelled.
     """
-    if "neck" not in head.joint_names or len(greys) < 2:
+    neck = head.joint_names.index("neck") if "neck" in head.joint_names else 0
+    if not neck or head.joint_parents[neck] != 0 or len(greys) < 2:
         return fit
     joints = head.joints(betas).astype(np.float64)
-    pivot = joints[head.joint_names.index("neck")]
+    pivot = joints[neck]
     start = rotations(fit.pose[:, 0])
     # the neck's joint is where the head has it
     held = np.einsum("fij,j->fi", start, pivot - joints[0]) + joints[0] + fit.translation
     points, normals = torso_points(head, betas)
     shown = _shown(points, start, held - start @ pivot, fit.focal, corners, side)
     arms, normals = points[shown] - pivot, normals[shown]
-    neck = head.joint_names.index("neck")
     nodding = start @ rotations(fit.pose[:, neck])
     turns = start
     for level, steps in _LEVELS:
@@ -99,10 +99,7 @@ def torso_points(head: HeadModel, betas: np.ndarray) -> tuple[np.ndarray, np.nda
     share = np.where(torso & (normal[:, 2] > 0), np.linalg.norm(normal, axis=1), 0.0)
     if not share.any():
         return np.zeros((0, 3)), np.zeros((0, 3))
-    rng = np.random.default_rng(0)
-    triangles = rng.choice(len(share), _TRIED, p=share / share.sum())
-    u, v = np.sqrt(rng.random(_TRIED)), rng.random(_TRIED)
-    mix = np.stack([1 - u, u * (1 - v), u * v], axis=1)
+    triangles, mix = scattered(share, _TRIED)
     corners = head.triangles[triangles]
     directions = vertex_normals(vertices, head.triangles)[corners]
     spread = [np.einsum("lv,lvx->lx", mix, values) for values in (vertices[corners], directions)]
@@ -186,9 +183,8 @@ def _step(
     # hair that hangs over the shoulders turns with the head: what looks the same there is left out
     own = stray_with_head**_SHARP / (stray_with_head**_SHARP + look.stray**_SHARP)
     weights = _INDEPENDENT * look.base * robust * own / usual**2
-    # d point / d turn = - [spun]x
     slopes = np.einsum("flp,flpi->fli", look.gradient, project_slopes(look.places, focal))
-    slopes = -np.einsum("fli,flij->flj", slopes, cross_matrices(look.spun))
+    slopes = np.cross(look.spun, slopes)  # by a turn of the point about the joint
     matrix = np.einsum("fl,fli,flj->fij", weights, slopes, slopes) + np.eye(3) / _SPREAD**2
     away = axis_angles(turns @ start.transpose(0, 2, 1))
     right = np.einsum("fl,fli,fl->fi", weights, slopes, look.residual) + away / _SPREAD**2
