@@ -28,10 +28,12 @@ _POINTS, _TRIED = 600, 6_000
 # what is worn there rests on the shoulders all the same, and is often all that a picture shows.
 _TORSO = 0.4
 _SPREAD = 0.1  # radians that shoulders turn from how a clip shows them on the whole
-_INDEPENDENT = 0.02  # of residuals: neighbouring points tell nearly the same
+_INDEPENDENT = 0.05  # of residuals: neighbouring points tell nearly the same
 _FLOOR = 0.05
 _LONGEST = 0.05  # radians a step
 _FEWEST = 60  # points in the picture
+# where most points look little more alike than if they turned with the head, pictures tell less
+_DOUBT = 2
 _SHARP = 6  # how sharply points that go with the head are told from those that do not
 
 
@@ -70,7 +72,7 @@ def follow(
     shown = _shown(points, start, held - start @ pivot, fit.focal, corners, side)
     arms, normals = points[shown] - pivot, normals[shown]
     nodding = start @ rotations(fit.pose[:, neck])
-    turns = start
+    turns, trust = start, 1.0
     for level, steps in _LEVELS:
         pictures = _pictures(greys, corners, side, level)
         with_head = _look(nodding, held, arms, normals, fit.focal, pictures)
@@ -78,10 +80,14 @@ def follow(
             if should_stop is not None and should_stop():
                 raise Cancelled("tracking stopped; the same command goes on from here")
             turns, moved = _step(
-                turns, start, held, arms, normals, fit.focal, pictures, with_head.stray
+                turns, start, held, arms, normals, fit.focal, pictures, with_head.stray, trust
             )
             if moved < 1e-4:
                 break
+        if level == _LEVELS[0][0] and len(arms):
+            alike = _look(turns, held, arms, normals, fit.focal, pictures).stray
+            clear = float(np.median(with_head.stray / alike)) - 1
+            trust = min(max(clear, 0.0), 1.0) ** _DOUBT
     pose = fit.pose.copy()
     pose[:, 0] = axis_angles(turns)
     pose[:, neck] = axis_angles(turns.transpose(0, 2, 1) @ start @ rotations(fit.pose[:, neck]))
@@ -172,6 +178,7 @@ def _step(
     focal: float,
     pictures: Pictures,
     stray_with_head: np.ndarray,
+    trust: float,
 ) -> tuple[np.ndarray, float]:
     """Turns [F, 3, 3] after one Gauss-Newton step, and the longest of its turns, radians."""
     look = _look(turns, held, arms, normals, focal, pictures)
@@ -182,7 +189,7 @@ def _step(
     robust = 1 / (1 + look.residual**2 / (4 * usual**2)) ** 2
     # hair that hangs over the shoulders turns with the head: what looks the same there is left out
     own = stray_with_head**_SHARP / (stray_with_head**_SHARP + look.stray**_SHARP)
-    weights = _INDEPENDENT * look.base * robust * own / usual**2
+    weights = trust * _INDEPENDENT * look.base * robust * own / usual**2
     slopes = np.einsum("flp,flpi->fli", look.gradient, project_slopes(look.places, focal))
     slopes = np.cross(look.spun, slopes)  # by a turn of the point about the joint
     matrix = np.einsum("fl,fli,flj->fij", weights, slopes, slopes) + np.eye(3) / _SPREAD**2
