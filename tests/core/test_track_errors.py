@@ -11,6 +11,7 @@ from pav_blender.core.collection import read_collection
 from pav_blender.core.errors import InputError
 from pav_blender.core.evaluation.tracking import compare
 from pav_blender.core.images import read_rgba
+from pav_blender.core.tracking import shoulders, track
 from pav_blender.core.tracking.decode import open_video
 from pav_blender.core.tracking.landmark_model import axis_angles, rotations
 
@@ -19,9 +20,13 @@ STUDIO = Path(__file__).parents[2] / "data" / "studio3"
 
 @pytest.fixture(scope="module")
 def truth():
+    return _first(12)
+
+
+def _first(frames):
     collection = read_collection(STUDIO)
     clip = collection.clips[0]
-    rows = clip.indices("train")[:12]
+    rows = clip.indices("train")[:frames]
     parts = ("expression", "pose", "translation", "intrinsics", "camera_to_world", "frame_id")
     few = replace(
         clip, split=clip.split[rows], **{name: getattr(clip, name)[rows] for name in parts}
@@ -42,6 +47,7 @@ def test_the_truth_has_no_error(truth):
     assert errors.frames == errors.filmed == 12
     assert errors.reprojection_px < 1e-3
     assert errors.rotation_deg < 1e-2
+    assert errors.shoulders_px < 1e-3
     assert errors.expression_mm < 1e-3
     assert errors.shape_mm < 1e-3
     assert errors.focal_percent == 0
@@ -61,6 +67,28 @@ def test_a_turn_and_a_smile_too_much_are_told_apart(truth):
     errors = compare(truth, _found(truth, expression=wide))
     assert errors.rotation_deg < 1e-2
     assert errors.expression_mm > 0.2
+
+
+def test_shoulders_are_told_apart_from_the_head_and_from_how_they_rest(truth):
+    """Shoulders lean by 3 degrees under a head that stays: in every other frame, then in all."""
+    pose = truth.clips[0].pose.astype(np.float64)
+    lean = rotations(np.radians([0, 0, 3.0]))
+    found = []
+    for leaning in (np.arange(len(pose)) % 2 == 1, np.ones(len(pose), bool)):
+        bent, shift = pose.copy(), truth.clips[0].translation.copy()
+        was = rotations(pose[leaning, 0])
+        body = was @ lean
+        bent[leaning, 0] = axis_angles(body)
+        turned = body.transpose(0, 2, 1) @ was @ rotations(pose[leaning, 1])
+        bent[leaning, 1] = axis_angles(turned)
+        joints = truth.head.joints(truth.betas)
+        shift[leaning] += (was - body) @ (joints[1] - joints[0])
+        change = {"pose": bent.astype(np.float32), "translation": shift.astype(np.float32)}
+        found.append(compare(truth, _found(truth, **change)))
+    assert found[0].shoulders_px > 1
+    assert found[1].shoulders_px < 0.2 * found[0].shoulders_px
+    assert max(errors.rotation_deg for errors in found) < 1e-2
+    assert max(errors.reprojection_px for errors in found) < 0.1
 
 
 def test_another_person_with_the_same_motion(truth):
@@ -107,6 +135,26 @@ def test_a_film_shows_the_clip_before_a_room(truth, tmp_path):
     inside, outside = rgba[..., 3] == 255, rgba[..., 3] == 0
     assert np.abs(shown - rgba[..., :3])[inside].mean() < 8
     assert shown[outside].min() > 20  # a room, not the black of hidden pixels
+
+
+@pytest.mark.faces
+def test_tracked_shoulders_stay_on_what_they_wear(tmp_path, monkeypatch):
+    pytest.importorskip("mediapipe", reason="the optional mediapipe is not installed")
+    truth = _first(30)
+    clip = truth.clips[0]
+    video = film(truth, clip, tmp_path / f"{clip.name}.mp4", clip.width, seed=3)
+
+    def errors():
+        done = track([video], tmp_path / "out", size=96, cuts=False, overwrite=True)
+        return compare(truth, read_collection(done.path))
+
+    followed = errors()
+    monkeypatch.setattr(shoulders, "follow", lambda head, betas, fit, *pictures: fit)
+    hung = errors()
+    assert followed.shoulders_px < 0.85 * hung.shoulders_px
+    # the face is where it was, but for the skin between jaw and neck
+    assert followed.reprojection_px == pytest.approx(hung.reprojection_px, abs=0.1)
+    assert followed.rotation_deg == pytest.approx(hung.rotation_deg, abs=1e-3)
 
 
 def test_a_bad_track_meets_no_claim():

@@ -1,55 +1,28 @@
 """Photo-consistency on the studio's own pictures, whose truth is known."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+import studio_truth
 
-from pav_blender.core.collection import read_collection
-from pav_blender.core.images import read_rgba
 from pav_blender.core.tracking import fit as fitting
 from pav_blender.core.tracking import photo, terms
 from pav_blender.core.tracking.fit import HeadFit, refine_head
 from pav_blender.core.tracking.landmark_model import LandmarkModel, axis_angles, rotations
 from pav_blender.core.tracking.observe import Observations
-from pav_blender.core.tracking.terms import ClipFit, Photo, project
+from pav_blender.core.tracking.terms import Photo, project
 
-STUDIO = Path(__file__).parents[2] / "data" / "studio3"
 FRAMES = 16
 
 
 @pytest.fixture(scope="module")
 def filmed():
     """A studio clip: its truth as a fit, its frames, and landmarks without an error."""
-    collection = read_collection(STUDIO)
-    clip = collection.clip("crop")
-    rows = clip.indices("train")[:FRAMES]
-    head, flip = collection.head, np.diag([1.0, -1.0, -1.0])
-    to_camera = np.linalg.inv(clip.camera_to_world[rows].astype(np.float64))
-    pose = clip.pose[rows].astype(np.float64)
-    joints = head.joints(collection.betas).astype(np.float64)
-    turn = flip @ to_camera[:, :3, :3]
-    shift = to_camera[:, :3, 3] @ flip
-    body = turn @ rotations(pose[:, 0])
-    root = axis_angles(body[FRAMES // 2])
-    own = pose.copy()
-    own[:, 0] = root
-    own[:, 1] = axis_angles(rotations(root).T @ body @ rotations(pose[:, 1]))
-    bone = joints[1] - joints[0]
-    neck = rotations(pose[:, 0]) @ bone + joints[0] + clip.translation[rows]
-    neck = np.einsum("fij,fj->fi", turn, neck) + shift
-    translation = neck - (rotations(root) @ bone + joints[0])
-    focal = float(clip.intrinsics[0, 0, 0])
-    fit = ClipFit(focal, root, own, translation, clip.expression[rows].astype(np.float64))
-    pictures = []
-    for row in rows:
-        rgba = read_rgba(collection.image_path(clip, int(row))).astype(np.float32)
-        rgb = rgba[..., :3] * (rgba[..., 3:] / 255) + 110 * (1 - rgba[..., 3:] / 255)
-        pictures.append(rgb.astype(np.uint8))
-    model = LandmarkModel(head, len(collection.betas))
-    seen = _seen(model, collection.betas, fit, clip.width)
-    return head, np.asarray(collection.betas, np.float64), fit, seen, pictures
+    whole = studio_truth.filmed("crop", FRAMES)
+    fit = studio_truth.held_still(whole)
+    seen = _seen(LandmarkModel(whole.head, len(whole.betas)), whole.betas, fit, whole.clip.width)
+    return whole.head, whole.betas, fit, seen, whole.pictures
 
 
 def _seen(model, betas, fit, side):

@@ -9,6 +9,7 @@ import numpy as np
 from ..collection import Clip, Collection
 from ..deformation.rigid import head_rotation
 from ..errors import InputError
+from ..head.geometry import vertex_normals
 from ..tracking.landmark_model import rotations
 
 
@@ -18,11 +19,13 @@ class TrackErrors:
 
     frames: compared, of `filmed`; reprojection_px: a frame's median distance of face vertices on
     the picture, source pixels; reprojection_worst_px: its 95th percentile over frames;
-    rotation_deg: of the head to the camera; expression_mm: a frame's mean distance of the face's
-    vertices in the head's frame, each measured from its own neutral face; face_mm: the same of the
-    vertices themselves, each head laid on the other rigidly over the clips' neutral face;
-    shape_mm: mean distance of the neutral faces, laid on each other; focal_percent: mean of clips;
-    jitter: the face's mean acceleration on the picture over the truth's, frame to frame.
+    rotation_deg: of the head to the camera; shoulders_px: as reprojection, of the torso's front,
+    each vertex less what it misses by throughout the clip, for clothes hide a torso's shape (NaN:
+    none is in the picture); expression_mm: a frame's mean distance of the face's vertices in the
+    head's frame, each measured from its own neutral face; face_mm: the same of the vertices
+    themselves, each head laid on the other rigidly over the clips' neutral face; shape_mm: mean
+    distance of the neutral faces, laid on each other; focal_percent: mean of clips; jitter: the
+    face's mean acceleration on the picture over the truth's, frame to frame.
     """
 
     frames: int
@@ -30,6 +33,7 @@ class TrackErrors:
     reprojection_px: float
     reprojection_worst_px: float
     rotation_deg: float
+    shoulders_px: float
     expression_mm: float
     face_mm: float
     shape_mm: float
@@ -47,6 +51,7 @@ class _Both:
     pixels: tuple[np.ndarray, np.ndarray]  # [F,V,2] source pixels
     local: tuple[np.ndarray, np.ndarray]  # [F,V,3] in the head's frame, metres
     turns: tuple[np.ndarray, np.ndarray]  # [F,3,3] head to camera
+    swayed: np.ndarray  # [F] the torso, source pixels
     numbers: np.ndarray  # [F]
     focal: tuple[float, float]  # of the source frame's pixels
 
@@ -84,6 +89,7 @@ def compare(truth: Collection, found: Collection, *, size: int | None = None) ->
         reprojection_px=float(np.median(reprojection)),
         reprojection_worst_px=float(np.percentile(reprojection, 95)),
         rotation_deg=float(np.median(rotation)),
+        shoulders_px=float(np.median(np.concatenate([both.swayed for both in clips]))),
         expression_mm=1e3 * float(np.median(np.concatenate(expression))),
         face_mm=1e3 * float(np.median(np.concatenate(whole))),
         shape_mm=1e3 * float(np.linalg.norm(laid - neutral[0], axis=1).mean()),
@@ -109,27 +115,26 @@ def _both(
     scale = 1.0 if size is None else size / real.width
     centre = scale * np.array([real.width / 2, real.height / 2])
     true_focal = scale * float(real.intrinsics[0, 0, 0])
-    sides = (
-        _seen(truth, real, a, face, true_focal, centre),
-        _seen(found, seen, b, face, float(focal), centre),
+    there = _seen(truth, real, a, true_focal, centre)
+    here = _seen(found, seen, b, float(focal), centre)
+    return _Both(
+        (there[0][:, face], here[0][:, face]),
+        (there[1][:, face], here[1][:, face]),
+        (there[2], here[2]),
+        _swaying(truth, there[0], here[0], 2 * centre),
+        real.frame_id[a],
+        (true_focal, float(focal)),
     )
-    pixels, local, turns = zip(*sides, strict=True)
-    return _Both(pixels, local, turns, real.frame_id[a], (true_focal, float(focal)))
 
 
 def _seen(
-    collection: Collection,
-    clip: Clip,
-    rows: np.ndarray,
-    face: np.ndarray,
-    focal: float,
-    centre: np.ndarray,
+    collection: Collection, clip: Clip, rows: np.ndarray, focal: float, centre: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pixels [F,V,2] of the source frame, places [F,V,3] in the head's frame, turns [F,3,3]."""
     vertices = collection.posed(clip, rows).astype(np.float64)
     to_camera = np.linalg.inv(clip.camera_to_world[rows].astype(np.float64))
     own = np.einsum("fij,fvj->fvi", to_camera[:, :3, :3], vertices) + to_camera[:, None, :3, 3]
-    pixels = own[:, face, :2] / own[:, face, 2:] * focal + centre
+    pixels = own[..., :2] / own[..., 2:] * focal + centre
     pose = clip.pose[rows].astype(np.float64)
     head = rotations(pose[:, 0])
     still = pose.copy()
@@ -145,7 +150,7 @@ def _seen(
         np.zeros((len(rows), 3), np.float32),
     )
     local = _head_frame(collection.head, posed.numpy().astype(np.float64), collection.betas)
-    return pixels, local[:, face], to_camera[:, :3, :3] @ head
+    return pixels, local, to_camera[:, :3, :3] @ head
 
 
 def _head_frame(head, vertices: np.ndarray, betas: np.ndarray) -> np.ndarray:
@@ -163,6 +168,19 @@ def _angles(real: np.ndarray, seen: np.ndarray) -> np.ndarray:
     between = np.einsum("fij,fik->fjk", real, seen)
     cosine = (np.trace(between, axis1=1, axis2=2) - 1) / 2
     return np.degrees(np.arccos(cosine.clip(-1, 1)))
+
+
+def _swaying(truth: Collection, real: np.ndarray, seen: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """[F] how far torso vertices are apart on pictures of size [2], of all vertices [F,V,2], less
+    what is the same throughout."""
+    head = truth.head
+    torso = head.skinning_weights[:, 0] > 0.5
+    torso &= vertex_normals(head.template, head.triangles)[:, 2] > 0  # no picture shows a back
+    torso &= ((real > 0) & (real < size)).all(axis=(0, 2))
+    if not torso.any():
+        return np.full(len(real), np.nan)
+    apart = seen[:, torso] - real[:, torso]
+    return np.median(np.linalg.norm(apart - np.median(apart, axis=0), axis=2), axis=1)
 
 
 def _shake(pixels: np.ndarray, numbers: np.ndarray) -> float:

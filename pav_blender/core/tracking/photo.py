@@ -24,7 +24,7 @@ from .landmark_model import PointModel
 from numba import njit  # isort: skip
 
 assert _cpu
-SIDE = 224  # of a face's window, pixels
+SIDE = 224  # of a window, pixels
 _ROOM = 0.18  # of the face's extent, round it
 _LOCAL = 11  # pixels of the window that "local" means
 _QUIET = 0.03  # luminance's deviation below which skin counts as plain
@@ -62,13 +62,14 @@ def windows(
     corners = np.round((low + high) / 2 - side / 2)
     whole = round(side)
     for row, rgb in enumerate(frames):
-        features[row] = feature(_cut(rgb, corners[row].astype(int), whole))
+        features[row] = feature(luminance(rgb, corners[row].astype(int), whole))
     middle = np.array([width / 2, height / 2])
     return Pictures(features, corners - middle, np.full(count, SIDE / whole))
 
 
-def _cut(rgb: np.ndarray, corner: np.ndarray, side: int) -> np.ndarray:
-    """Luminance float32 [SIDE,SIDE] of a window that may reach beyond the frame."""
+def luminance(rgb: np.ndarray, corner: np.ndarray, side: int) -> np.ndarray:
+    """Of a square window of a frame uint8 [H,W,3], which may reach beyond it: float32 [SIDE,SIDE]
+    in [0, 1], and a little beyond where edges are sharp. corner [2] int: left and top."""
     height, width = rgb.shape[:2]
     rows = np.arange(corner[1], corner[1] + side).clip(0, height - 1)
     columns = np.arange(corner[0], corner[0] + side).clip(0, width - 1)

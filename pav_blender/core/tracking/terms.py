@@ -24,8 +24,8 @@ _ASTRAY = 1.0
 
 @dataclass(eq=False)
 class ClipFit:
-    """One clip: focal length in source pixels; root [3] constant; pose [F,J,3] with the root in
-    it; translation [F,3]; expression [F,E]."""
+    """One clip: focal length in source pixels; root [3], how the shoulders mostly turn; pose
+    [F,J,3], with the root in it; translation [F,3]; expression [F,E]."""
 
     focal: float
     root: np.ndarray
