@@ -2,7 +2,8 @@
 
 Long hair stands ten centimetres off the mesh and a bald forehead nothing, so no one band round
 the mesh would do. A canonical cell stays if, carried by the tracked mesh into the training frames
-of an appearance, it falls inside the mattes.
+of an appearance, it falls inside the mattes. Where pictures end the person does not: beyond what
+they show, cells near the mesh stay, for another pose or camera brings them in.
 """
 
 from __future__ import annotations
@@ -34,6 +35,8 @@ _NEARBY = 0.05  # metres along which what an outline tells holds
 _MARGIN = 0.008
 _SOFTNESS = 2  # pixels the mattes are grown by
 _LARGEST_STRETCH = 3.0
+# metres from the mesh, and from what pictures show, within which cells that none shows stay
+_NEAR, _BEYOND = 0.015, 0.04
 
 
 def reach_of(
@@ -91,10 +94,8 @@ def _centres(cells: int, box_min: np.ndarray, box_size: float) -> np.ndarray:
 def hull_box(
     canonical: np.ndarray, triangles: np.ndarray, frames: list[Frame], reach: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Corner [3] and side, metres, of the cube that holds what the pictures show of the head.
-
-    Shoulders that no camera sees need no cells.
-    """
+    """Corner [3] and side, metres, of the cube that holds what `carve` leaves: shoulders far below
+    the pictures need no cells."""
     low, high = canonical.min(0) - reach.max(), canonical.max(0) + reach.max()
     cells = 48
     size = float((high - low).max())
@@ -125,7 +126,8 @@ def carve(
 
     reach [V]: metres from each vertex that anything may be.
 
-    A cell that no frame has in its picture goes too: nothing there could be learned.
+    A cell that no frame has in its picture stays near the mesh and near what is seen: the field
+    goes on there as it was begun, in the colours of what is beside it. Farther off it goes.
     """
     side = box_size / cells
     band = _band(canonical, triangles, _centres(cells, box_min, box_size), reach + side / 2)
@@ -134,18 +136,24 @@ def carve(
     missed = np.zeros(len(band.row), np.int32)
     for frame in chosen:
         _count(frame, _carry(canonical, frame, triangles, band), side, seen, missed)
-    kept = np.zeros(cells**3, bool)
-    kept[band.row] = (seen > 0) & (missed <= _MISSES * seen)
-    return kept.reshape((cells,) * 3)
+    kept = np.zeros((cells,) * 3, bool)
+    kept.flat[band.row] = (seen > 0) & (missed <= _MISSES * seen)
+    if kept.any():
+        unseen = band.row[(seen == 0) & (band.distance <= _NEAR + side / 2)]
+        apart = ndimage.distance_transform_edt(~kept, sampling=side)
+        kept.flat[unseen[apart.flat[unseen] <= _BEYOND]] = True
+    return kept
 
 
 @dataclass(eq=False)
 class _Band:
-    """Cells near the mesh and not deep inside it: flat row, centre, nearest triangle."""
+    """Cells near the mesh and not deep inside it: flat row, centre, nearest triangle, metres from
+    that."""
 
     row: np.ndarray
     points: np.ndarray
     triangle: np.ndarray
+    distance: np.ndarray
 
 
 def _band(
@@ -160,7 +168,7 @@ def _band(
     inside = ((points - foot) * normal).sum(1) < 0
     allowed = (reach[triangles[triangle]] * barycentric).sum(1)
     row = np.flatnonzero(distance <= np.where(inside, _INSIDE, allowed))
-    return _Band(row, points[row], triangle[row])
+    return _Band(row, points[row], triangle[row], distance[row])
 
 
 def _carry(canonical: np.ndarray, frame: Frame, triangles: np.ndarray, band: _Band) -> np.ndarray:
