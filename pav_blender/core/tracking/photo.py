@@ -26,7 +26,7 @@ from numba import njit  # isort: skip
 assert _cpu
 SIDE = 224  # of a window, pixels
 _ROOM = 0.18  # of the face's extent, round it
-_LOCAL = 11  # pixels of the window that "local" means
+_LOCAL = 7  # pixels of the window that "local" means
 _QUIET = 0.03  # luminance's deviation below which skin counts as plain
 _STEP = 1 / 32  # of a stored feature
 _POINTS = 1600
@@ -79,12 +79,12 @@ def luminance(rgb: np.ndarray, corner: np.ndarray, side: int) -> np.ndarray:
     return resize(grey[..., None], SIDE)[..., 0]
 
 
-def feature(grey: np.ndarray) -> np.ndarray:
-    """What is compared, int8 [H, W], of luminance float32 [H, W] in [0, 1]."""
+def feature(grey: np.ndarray, local: int = _LOCAL) -> np.ndarray:
+    """What is compared, int8 [H, W], of luminance float32 [H, W] in [0, 1]; local: pixels."""
     smooth = gaussian_filter(grey, 1.0)
-    mean = uniform_filter(uniform_filter(smooth, _LOCAL), _LOCAL)
+    mean = uniform_filter(uniform_filter(smooth, local), local)
     off = smooth - mean
-    squares = uniform_filter(uniform_filter(off * off, _LOCAL), _LOCAL)
+    squares = uniform_filter(uniform_filter(off * off, local), local)
     deviation = np.sqrt(squares.clip(0))  # running sums may fall below 0
     return np.round(off / (deviation + _QUIET) / _STEP).clip(-127, 127).astype(np.int8)
 

@@ -23,6 +23,7 @@ from .photo import SIDE, Pictures, feature, luminance, sample, scattered, templa
 from .terms import ClipFit, project, project_slopes
 
 _LEVELS = ((4, 12), (2, 6), (1, 6))  # pixels taken together, and steps at that size
+_LOCAL = 11  # pixels of that size; cloth has less to see than a face, and more to be far off by
 _POINTS, _TRIED = 600, 6_000
 # Skinning weight of the root from which a point is followed. Meshes blend collars with the neck;
 # what is worn there rests on the shoulders all the same, and is often all that a picture shows.
@@ -144,7 +145,7 @@ def _shown(pixels: np.ndarray, corners: np.ndarray, side: int) -> np.ndarray:
 def _pictures(greys: np.ndarray, corners: np.ndarray, side: int, level: int) -> Pictures:
     size = SIDE // level
     small = greys.reshape(len(greys), size, level, size, level).mean(axis=(2, 4), dtype=np.float32)
-    features = np.stack([feature(grey / 255) for grey in small])
+    features = np.stack([feature(grey / 255, _LOCAL) for grey in small])
     return Pictures(features, corners.astype(np.float64), np.full(len(greys), size / side))
 
 
