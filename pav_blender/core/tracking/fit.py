@@ -27,7 +27,7 @@ _COARSE_FRAMES, _COARSE_STEPS, _FINE_STEPS = 40, 10, 5
 # blur of the pictures in pixels of a face's window, and steps with it
 _PHOTO_LEVELS = ((3.0, 5), (0.0, 8))
 # once pictures speak, landmarks only say where on the face the skin is
-_LANDMARKS_LEFT = 0.05
+_LANDMARKS_LEFT = 0.07
 # of the way from a clip's own look to what all clips show
 _SHARED = 0.7
 _FOREHEAD, _CHIN = 10, 152
