@@ -35,8 +35,8 @@ _NEARBY = 0.05  # metres along which what an outline tells holds
 _MARGIN = 0.008
 _SOFTNESS = 2  # pixels the mattes are grown by
 _LARGEST_STRETCH = 3.0
-# metres from the mesh, and from what pictures show, within which cells that none shows stay
-_NEAR, _BEYOND = 0.015, 0.04
+UNSEEN_REACH = 0.015  # metres from the mesh within which cells that nothing shows stay
+_BEYOND = 0.04  # metres from what pictures show within which they stay where pictures end
 
 
 def reach_of(
@@ -139,7 +139,7 @@ def carve(
     kept = np.zeros((cells,) * 3, bool)
     kept.flat[band.row] = (seen > 0) & (missed <= _MISSES * seen)
     if kept.any():
-        unseen = band.row[(seen == 0) & (band.distance <= _NEAR + side / 2)]
+        unseen = band.row[(seen == 0) & (band.distance <= UNSEEN_REACH + side / 2)]
         apart = ndimage.distance_transform_edt(~kept, sampling=side)
         kept.flat[unseen[apart.flat[unseen] <= _BEYOND]] = True
     return kept

@@ -15,13 +15,13 @@ from ..deformation import Clearance, Deformer
 from ..field.avatar import Avatar
 from ..kernels.reference.picking import LEAST
 from ..rendering.wearing import clearance_of
+from .carving import UNSEEN_REACH
 
 _MUCH = 0.5  # part of the space that is left when voxels are worth finding anew
 _SEEN = 0.1  # transmittance from which a look at a cell counts
 _LOOKS = 8.0  # looks after which a cell is judged
 _BLOCK_LOOKS = 16.0  # the same for eight cells together
 _LEAST_WEIGHT = 2e-3  # a millimetre; untrained fog has about twice that
-_UNSEEN_REACH = 0.015  # metres from the mesh within which cells that no ray saw are kept
 _HIDDEN = 12  # rounds without a look after which a cell counts as hidden
 
 
@@ -49,7 +49,7 @@ class Visibility:
         self._box = avatar.box_min, avatar.box_size
         self._one_geometry = avatar.config.one_geometry
         distance = mesh_distance(avatar, deformer)
-        self._near = (distance <= _UNSEEN_REACH).numpy()
+        self._near = (distance <= UNSEEN_REACH).numpy()
         density = torch.exp(avatar.field.untrained(distance)) * 1e3
         self.guide = density.repeat(len(occupied), 1, 1, 1)
         self.weight = torch.zeros(occupied.size)
