@@ -216,7 +216,8 @@ def test_training_learns_the_person_and_tells_the_appearances_apart(toy, toy_ava
 
 def test_space_is_emptied_while_learning(toy, frames, toy_avatar, small_config):
     before = new_avatar(toy, frames, small_config).occupied.mean()
-    assert 0.3 * before < toy_avatar.occupied.mean() < 0.97 * before
+    # what lies beyond the pictures is neither looked at nor emptied
+    assert 0.3 * before < toy_avatar.occupied.mean() < 0.99 * before
 
 
 def test_a_longer_training_empties_space_no_oftener(toy, frames, small_config):
