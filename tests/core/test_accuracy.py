@@ -153,19 +153,6 @@ def test_a_unit_that_rounding_turns_is_found_and_its_sample_left_out(toy_avatar,
             double.load_state_dict(avatar.field.state_dict())
             return ours, ask(avatar, double, pixels, picked, torch.float64, *rest)
 
-    # a bias that puts the input of a unit to 0 but for rounding: float32 often says exactly 0
-    avatar = dataclasses.replace(toy_avatar, field=copy.deepcopy(toy_avatar.field))
-    bias = avatar.field.density.biases[0]
-    name = "units of the density network"
-    for sample in range(100):
-        bias.data.copy_(toy_avatar.field.density.biases[0])
-        exact = both(gradients.decided, avatar, picked)[1][name]
-        bias.data[0] -= float(exact[sample, 0])
-        ours, exact = both(gradients.decided, avatar, picked)
-        rows, alike = gradients.compared(ours, exact)
-        if not alike.all():
-            break
-    assert (~alike).sum() == sum(r["on the other side"] for r in rows) == 1
     everything = torch.ones(len(pixels.rays), dtype=torch.bool)
 
     def off(picked):
@@ -173,6 +160,21 @@ def test_a_unit_that_rounding_turns_is_found_and_its_sample_left_out(toy_avatar,
         a, b = a["density.biases.0"].double()[0], b["density.biases.0"][0]
         return abs(float((a - b) / b))
 
+    # a bias that puts the input of a unit to 0 but for rounding: float32 often says exactly 0.
+    # Of samples for which it does, one that the gradient is felt to lack
+    avatar = dataclasses.replace(toy_avatar, field=copy.deepcopy(toy_avatar.field))
+    bias = avatar.field.density.biases[0]
+    name = "units of the density network"
+    for sample in range(400):
+        bias.data.copy_(toy_avatar.field.density.biases[0])
+        exact = both(gradients.decided, avatar, picked)[1][name]
+        bias.data[0] -= float(exact[sample, 0])
+        ours, exact = both(gradients.decided, avatar, picked)
+        rows, alike = gradients.compared(ours, exact)
+        if not alike.all() and off(picked) > 1e-4:
+            break
+    assert (~alike).sum() == sum(r["on the other side"] for r in rows) == 1
+    assert off(picked) > 1e-4
     assert off(picked) > 10 * off(gradients.chosen(picked, alike))
 
 
