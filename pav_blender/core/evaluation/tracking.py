@@ -20,9 +20,9 @@ class TrackErrors:
     frames: compared, of `filmed`; reprojection_px: a frame's median distance of face vertices on
     the picture, source pixels; reprojection_worst_px: its 95th percentile over frames;
     rotation_deg: of the head to the camera; shoulders_px: as reprojection, of the torso's front,
-    each vertex less what it misses by throughout the clip, for clothes hide a torso's shape (NaN:
-    none is in the picture); expression_mm: a frame's mean distance of the face's vertices in the
-    head's frame, each measured from its own neutral face; face_mm: the same of the vertices
+    each vertex less what it misses by throughout the clip, for clothes hide a torso's shape (NaN: a
+    clip has none in its pictures); expression_mm: a frame's mean distance of the face's vertices in
+    the head's frame, each measured from its own neutral face; face_mm: the same of the vertices
     themselves, each head laid on the other rigidly over the clips' neutral face; shape_mm: mean
     distance of the neutral faces, laid on each other; focal_percent: mean of clips; jitter: the
     face's mean acceleration on the picture over the truth's, frame to frame.
