@@ -12,6 +12,9 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
 
+# as `pav` does, before numpy is there
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 # torch.optim looks for triton, which crashes in a process where Blender 5.2 is loaded
 sys.modules.setdefault("triton", None)  # type: ignore[arg-type]
 

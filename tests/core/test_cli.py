@@ -52,6 +52,20 @@ def test_the_list_of_verbs_and_unknown_ones(capsys):
     assert main(["train", "--out"]) == 2
 
 
+def test_blas_keeps_to_one_thread_unless_told_otherwise():
+    code = (
+        "import sys, pav_blender.cli as cli; assert 'numpy' not in sys.modules;"
+        "cli.main(['doctor', '--help']); import numpy, os; print(os.environ[sys.argv[1]])"
+    )
+    name = "OPENBLAS_NUM_THREADS"
+    others = {key: value for key, value in os.environ.items() if key != name}
+    for given, expected in (({}, "1"), ({name: "3"}, "3")):
+        done = subprocess.run(
+            [sys.executable, "-c", code, name], env=others | given, capture_output=True, text=True
+        )
+        assert done.stdout.split()[-1:] == [expected], done.stderr
+
+
 def test_info_and_doctor(toy_avatar_path):
     assert '"plain"' in pav("info", toy_avatar_path).stdout
     assert '"torch"' in pav("doctor").stdout

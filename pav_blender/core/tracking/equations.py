@@ -12,7 +12,7 @@ from . import bordered, priors
 from .landmark_model import PointModel
 from .terms import ClipFit, Term
 
-_CHUNK = 32
+_CHUNK = 16  # frames
 _HELD = 1e9  # stiffness of what may not move
 
 
@@ -87,41 +87,75 @@ def _bends(values: np.ndarray, triples: np.ndarray) -> np.ndarray:
 
 
 def step(problem: Problem, betas: np.ndarray, clips: list[ClipFit]) -> list[bordered.Normal]:
-    """The normal equations, a clip each; the first carries the shared unknowns' priors."""
-    normals = each(lambda index: _normal(problem, index, betas, clips), len(clips))
+    """The normal equations, a clip each; the first carries the shared unknowns' priors. Shared
+    unknowns: betas, then log focal and root a clip."""
+    normals = [_zeros(problem.model.shapes, fit, len(clips)) for fit in clips]
+    pieces = [
+        (index, slice(start, start + _CHUNK))
+        for index, fit in enumerate(clips)
+        for start in range(0, len(fit.pose), _CHUNK)
+    ]
+    sums = each(lambda at: _add_terms(problem, normals, *pieces[at], betas, clips), len(pieces))
+    for (index, _), (common, pull) in zip(pieces, sums, strict=True):
+        mine = _columns(problem.model, index)
+        normals[index].shared[np.ix_(mine, mine)] += common
+        normals[index].shared_gradient[mine] += pull
+    each(lambda index: _add_expected(problem, index, normals[index], clips[index]), len(clips))
     _add_shared_priors(problem, normals[0], betas, clips)
     return normals
 
 
-def _normal(
-    problem: Problem, index: int, betas: np.ndarray, clips: list[ClipFit]
-) -> bordered.Normal:
-    """Of clip `index`; shared unknowns: betas, then log focal and root a clip."""
-    model, prior = problem.model, problem.prior
-    expected, fit = problem.expected[index], clips[index]
-    values = unknowns(fit)
-    frames, size = values.shape
-    shared = model.shapes + 4 * len(clips)
+def _zeros(shapes: int, fit: ClipFit, clips: int) -> bordered.Normal:
+    frames, size = unknowns(fit).shape
+    shared = shapes + 4 * clips
+    return bordered.Normal(
+        np.zeros((frames, size, size)),
+        np.zeros((frames, size, shared)),
+        np.zeros((shared, shared)),
+        np.zeros((frames, size)),
+        np.zeros(shared),
+        (np.zeros((frames, size)), np.zeros((frames, size))),
+    )
+
+
+def _columns(model: PointModel, index: int) -> np.ndarray:
+    """Of the shared unknowns, those of clip `index`."""
     mine = model.shapes + 4 * index
-    columns = np.r_[0 : model.shapes, mine : mine + 4]
-    own = np.zeros((frames, size, size))
-    border = np.zeros((frames, size, shared))
-    common = np.zeros((shared, shared))
-    gradient = np.zeros((frames, size))
-    common_gradient = np.zeros(shared)
-    for start in range(0, frames, _CHUNK):
-        rows = slice(start, start + _CHUNK)
-        for term in problem.terms[index]:
-            residual, slopes = term.linearised(betas, fit, rows)
-            across = slopes.transpose(0, 2, 1)
-            product = (across @ slopes).astype(np.float64)
-            pull = (across @ residual[..., None])[..., 0].astype(np.float64)
-            own[rows] += product[:, :size, :size]
-            border[rows, :, columns] += product[:, :size, size:]
-            gradient[rows] += pull[:, :size]
-            common[np.ix_(columns, columns)] += product[:, size:, size:].sum(axis=0)
-            common_gradient[columns] += pull[:, size:].sum(axis=0)
-    diagonal = np.arange(size)
+    return np.r_[0 : model.shapes, mine : mine + 4]
+
+
+def _add_terms(
+    problem: Problem,
+    normals: list[bordered.Normal],
+    index: int,
+    rows: slice,
+    betas: np.ndarray,
+    clips: list[ClipFit],
+) -> tuple[np.ndarray, np.ndarray]:
+    """What pictures and landmarks say of some frames of clip `index`, added to their own equations;
+    given back: what they say of the shared unknowns in `_columns`, matrix and gradient."""
+    normal, columns = normals[index], _columns(problem.model, index)
+    size = normal.gradient.shape[1]
+    common = np.zeros((len(columns), len(columns)))
+    common_pull = np.zeros(len(columns))
+    for term in problem.terms[index]:
+        residual, slopes = term.linearised(betas, clips[index], rows)
+        across = slopes.transpose(0, 2, 1)
+        product = (across @ slopes).astype(np.float64)
+        pull = (across @ residual[..., None])[..., 0].astype(np.float64)
+        normal.own[rows] += product[:, :size, :size]
+        normal.border[rows, :, columns] += product[:, :size, size:]
+        normal.gradient[rows] += pull[:, :size]
+        common += product[:, size:, size:].sum(axis=0)
+        common_pull += pull[:, size:].sum(axis=0)
+    return common, common_pull
+
+
+def _add_expected(problem: Problem, index: int, normal: bordered.Normal, fit: ClipFit) -> None:
+    """Adds what is expected of a clip's frames beforehand, and holds what stands at a limit."""
+    prior, expected = problem.prior, problem.expected[index]
+    own, gradient, values = normal.own, normal.gradient, unknowns(fit)
+    diagonal = np.arange(values.shape[1])
     own[:, diagonal, diagonal] += expected.weight
     gradient += expected.weight * (values - expected.mean)
     for i, j, stiff in prior.pairs:
@@ -131,29 +165,25 @@ def _normal(
         own[:, j, i] -= stiff
         gradient[:, i] += stiff * (values[:, i] - values[:, j])
         gradient[:, j] -= stiff * (values[:, i] - values[:, j])
-    couplings = _add_steadiness(expected, values, own, gradient)
+    _add_steadiness(expected, values, normal)
     # what stands at a limit and would go past it stays where it is
     held = ((values <= prior.low) & (gradient > 0)) | ((values >= prior.high) & (gradient < 0))
     own[:, diagonal, diagonal] += np.where(held, _HELD, 0.0)
-    return bordered.Normal(own, border, common, gradient, common_gradient, couplings)
 
 
-def _add_steadiness(
-    expected: Expected, values: np.ndarray, own: np.ndarray, gradient: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Adds the weight on second differences; returns what joins frames to the next two."""
+def _add_steadiness(expected: Expected, values: np.ndarray, normal: bordered.Normal) -> None:
+    """Adds the weight on second differences, which join frames to the next two."""
     steady, triples = expected.steady, expected.triples
     diagonal = np.arange(values.shape[1])
-    next_one, next_two = np.zeros_like(values), np.zeros_like(values)
+    next_one, next_two = normal.couplings
     bends = steady * _bends(values, triples)
     for offset, factor in ((-1, 1.0), (0, -2.0), (1, 1.0)):
         at = triples + offset
-        own[at[:, None], diagonal, diagonal] += factor**2 * steady
-        gradient[at] += factor * bends
+        normal.own[at[:, None], diagonal, diagonal] += factor**2 * steady
+        normal.gradient[at] += factor * bends
     next_one[triples - 1] -= 2 * steady
     next_one[triples] -= 2 * steady
     next_two[triples - 1] += steady
-    return next_one, next_two
 
 
 def _add_shared_priors(
