@@ -24,8 +24,8 @@ from .terms import ClipFit, Landmarks, Photo, with_weight
 
 # identity and lens are found on so many frames of each clip, then all frames follow
 _COARSE_FRAMES, _COARSE_STEPS, _FINE_STEPS = 40, 10, 5
-# blur of the pictures in pixels of a face's window, and steps with it
-_PHOTO_LEVELS = ((3.0, 5), (0.0, 8))
+# blur of the pictures in pixels of a face's window, and at most so many steps with it
+_PHOTO_LEVELS = ((3.0, 10), (0.0, 8))
 # once pictures speak, landmarks only say where on the face the skin is
 _LANDMARKS_LEFT = 0.07
 # of the way from a clip's own look to what all clips show
