@@ -72,7 +72,7 @@ def test_pictures_leave_the_truth_alone(filmed, monkeypatch):
     head, betas, truth, seen, pictures = filmed
     start = HeadFit(betas, [truth], [], [])
     found = refine_head(head, [seen], start, [_windows(seen, pictures)], rates=[10.0])
-    assert np.median(_turn_errors(found.clips[0], truth)) < 0.55
+    assert np.median(_turn_errors(found.clips[0], truth)) < 0.65
     shown = _seen(LandmarkModel(head, len(betas)), found.betas, found.clips[0], seen.width)
     off = np.linalg.norm(shown.landmarks - seen.landmarks, axis=2)
     assert np.median(off) < 0.7
