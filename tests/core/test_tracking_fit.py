@@ -9,7 +9,7 @@ import pytest
 from pav_blender.core.errors import Cancelled, InputError
 from pav_blender.core.head import builtin_head
 from pav_blender.core.rendering.cameras import Camera
-from pav_blender.core.tracking import bordered
+from pav_blender.core.tracking import bordered, equations
 from pav_blender.core.tracking.fit import fit_head, world
 from pav_blender.core.tracking.landmark_model import (
     OFFSETS_PATH,
@@ -179,6 +179,17 @@ def test_fit_is_the_same_every_time(head):
     first, second = fit_head(head, seen), fit_head(head, seen)
     assert np.array_equal(first.betas, second.betas)
     assert np.array_equal(first.clips[0].pose, second.clips[0].pose)
+
+
+def test_frames_taken_together_or_in_pieces_make_one_fit(fitted, head, monkeypatch):
+    _, seen, found = fitted
+    assert len(seen[0]) > 2 * equations._CHUNK
+    monkeypatch.setattr(equations, "_CHUNK", 1000)
+    whole = fit_head(head, seen)
+    assert np.abs(whole.betas - found.betas).max() < 1e-3
+    for one, other in zip(whole.clips, found.clips, strict=True):
+        assert one.focal == pytest.approx(other.focal, rel=1e-4)
+        assert np.abs(one.pose - other.pose).max() < 1e-4
 
 
 def test_gaps_and_very_short_clips(head):
