@@ -104,7 +104,9 @@ def films(person: Collection, folder: Path, size: int) -> list[Path]:
 def film(person: Collection, clip: Clip, path: Path, size: int, seed: int) -> Path:
     room = _room(size, seed)
     with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=_RATE, options={"crf": _QUALITY})
+        # one thread: what the encoder writes depends on their number
+        options = {"crf": _QUALITY, "threads": "1"}
+        stream = container.add_stream("libx264", rate=_RATE, options=options)
         stream.width = stream.height = size
         stream.pix_fmt = "yuv420p"
         for row in clip.indices("train", "test"):

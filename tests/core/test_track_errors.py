@@ -47,6 +47,8 @@ def test_the_truth_has_no_error(truth):
     assert errors.frames == errors.filmed == 12
     assert errors.reprojection_px < 1e-3
     assert errors.rotation_deg < 1e-2
+    assert errors.rotation_mean_deg < 1e-2
+    assert errors.yaw_percent < 0.1
     assert errors.shoulders_px < 1e-3
     assert errors.expression_mm < 1e-3
     assert errors.shape_mm < 1e-3
@@ -67,6 +69,24 @@ def test_a_turn_and_a_smile_too_much_are_told_apart(truth):
     errors = compare(truth, _found(truth, expression=wide))
     assert errors.rotation_deg < 1e-2
     assert errors.expression_mm > 0.2
+
+
+def test_a_turn_too_far_is_told_apart_from_a_head_that_looks_aside(truth):
+    """Of a turn error, what is the same throughout a clip, and what grows with the turn."""
+    pose = truth.clips[0].pose.astype(np.float64)
+    camera = truth.clips[0].camera_to_world[:, :3, :3].astype(np.float64)
+    shoulders = np.linalg.inv(camera) @ rotations(pose[:, 0])
+    turns = shoulders @ rotations(pose[:, 1])
+    left, _, right = np.linalg.svd(turns.mean(axis=0))
+    swing = axis_angles(turns @ (left @ right).T)
+    aside = np.tile(np.radians([0.0, 2.0, 0.0]), (len(pose), 1))
+    farther = swing * (0, 0.1, 0)
+    for more, mean, share in ((aside, 2, 0), (farther - farther.mean(axis=0), 0, 10)):
+        turned = pose.copy()
+        turned[:, 1] = axis_angles(np.linalg.inv(shoulders) @ rotations(more) @ turns)
+        errors = compare(truth, _found(truth, pose=turned.astype(np.float32)))
+        assert errors.rotation_mean_deg == pytest.approx(mean, abs=0.05)
+        assert errors.yaw_percent == pytest.approx(share, abs=0.5)
 
 
 def test_shoulders_are_told_apart_from_the_head_and_from_how_they_rest(truth):

@@ -10,7 +10,7 @@ from ..collection import Clip, Collection
 from ..deformation.rigid import head_rotation
 from ..errors import InputError
 from ..head.geometry import vertex_normals
-from ..tracking.landmark_model import rotations
+from ..tracking.landmark_model import axis_angles, rotations
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,9 @@ class TrackErrors:
 
     frames: compared, of `filmed`; reprojection_px: a frame's median distance of face vertices on
     the picture, source pixels; reprojection_worst_px: its 95th percentile over frames;
-    rotation_deg: of the head to the camera; shoulders_px: as reprojection, of the torso's front,
+    rotation_deg: of the head to the camera; of that, rotation_mean_deg: of a clip's mean turn, and
+    yaw_percent: how much more or less the head is found to turn to the side than it does, both
+    means of clips; shoulders_px: as reprojection, of the torso's front,
     each vertex less what it misses by throughout the clip, for clothes hide a torso's shape (NaN: a
     clip has none in its pictures); expression_mm: a frame's mean distance of the face's vertices in
     the head's frame, each measured from its own neutral face; face_mm: the same of the vertices
@@ -33,6 +35,8 @@ class TrackErrors:
     reprojection_px: float
     reprojection_worst_px: float
     rotation_deg: float
+    rotation_mean_deg: float
+    yaw_percent: float
     shoulders_px: float
     expression_mm: float
     face_mm: float
@@ -75,6 +79,7 @@ def compare(truth: Collection, found: Collection, *, size: int | None = None) ->
     clips = [_both(truth, found, clip.name, face, size) for clip in found.clips]
     reprojection = np.concatenate([_apart(*both.pixels) for both in clips])
     rotation = np.concatenate([_angles(*both.turns) for both in clips])
+    parts = np.abs([_turn_parts(*both.turns) for both in clips])
     expression, whole, jitters = [], [], []
     for both in clips:
         real, seen = both.local
@@ -89,6 +94,8 @@ def compare(truth: Collection, found: Collection, *, size: int | None = None) ->
         reprojection_px=float(np.median(reprojection)),
         reprojection_worst_px=float(np.percentile(reprojection, 95)),
         rotation_deg=float(np.median(rotation)),
+        rotation_mean_deg=float(parts[:, 0].mean()),
+        yaw_percent=100 * float(parts[:, 1].mean()),
         shoulders_px=float(np.median(np.concatenate([both.swayed for both in clips]))),
         expression_mm=1e3 * float(np.median(np.concatenate(expression))),
         face_mm=1e3 * float(np.median(np.concatenate(whole))),
@@ -168,6 +175,17 @@ def _angles(real: np.ndarray, seen: np.ndarray) -> np.ndarray:
     between = np.einsum("fij,fik->fjk", real, seen)
     cosine = (np.trace(between, axis1=1, axis2=2) - 1) / 2
     return np.degrees(np.arccos(cosine.clip(-1, 1)))
+
+
+def _turn_parts(real: np.ndarray, seen: np.ndarray) -> tuple[float, float]:
+    """Degrees between the mean turns of a clip's rotations [F,3,3], and by what share of the way to
+    the side, about the picture's vertical, they are found to turn too far."""
+    missed = axis_angles(seen @ real.transpose(0, 2, 1))
+    left, _, right = np.linalg.svd(real.mean(axis=0))
+    swing = axis_angles(real @ (left @ right).T)[:, 1]
+    swing -= swing.mean()
+    share = float(swing @ missed[:, 1]) / max(float(swing @ swing), 1e-9)
+    return float(np.degrees(np.linalg.norm(missed.mean(axis=0)))), share
 
 
 def _swaying(truth: Collection, real: np.ndarray, seen: np.ndarray, size: np.ndarray) -> np.ndarray:
